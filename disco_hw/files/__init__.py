@@ -13,9 +13,10 @@ import re
 import stat
 import tomllib
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 from msgspec import inspect
@@ -92,15 +93,21 @@ def open_file(path: Path, kind: FileKind) -> int:
     return descriptor
 
 
-def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
-    """Return the contents of a file, with the status of the very file that was read; raises InputError."""
+@contextmanager
+def _reading(path: Path, kind: FileKind) -> Iterator[BinaryIO]:
+    """Open a file that is fit to be read; what fails while it is read becomes an InputError."""
     with os.fdopen(open_file(path, kind), "rb") as file:
-        status = os.fstat(file.fileno())
         try:
-            # A file may grow, and those of /proc have no size to begin with.
-            content = file.read(kind.most_bytes + 1)
+            yield file
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
+
+
+def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
+    """Return the contents of a file, with the status of the very file that was read; raises InputError."""
+    with _reading(path, kind) as file:
+        # A file may grow, and those of /proc have no size to begin with.
+        status, content = os.fstat(file.fileno()), file.read(kind.most_bytes + 1)
     if len(content) > kind.most_bytes:
         raise _too_large(path, kind)
     return content, status
@@ -108,11 +115,8 @@ def read_bytes(path: Path, kind: FileKind) -> tuple[bytes, os.stat_result]:
 
 def begin_of(path: Path, kind: FileKind, count: int) -> bytes:
     """Return the first bytes of a file, fewer where it has fewer; raises InputError."""
-    with os.fdopen(open_file(path, kind), "rb") as file:
-        try:
-            return file.read(count)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
+    with _reading(path, kind) as file:
+        return file.read(count)
 
 
 def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
@@ -120,14 +124,13 @@ def read_lines(path: Path, kind: FileKind) -> Iterator[str]:
 
     Raises InputError, also for a line without an end.
     """
-    # Spreadsheets write a mark before the first column's name.
-    with io.TextIOWrapper(os.fdopen(open_file(path, kind), "rb"), encoding="utf-8-sig", newline="") as file:
+    with _reading(path, kind) as file:
         size = number = 0
+        # Spreadsheets write a mark before the first column's name.
+        text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
         while True:
             try:
-                line = file.readline(LONGEST_LINE + 1)
-            except OSError as error:
-                raise InputError(f"{path}: cannot be read ({_why(error)}); {kind.hint}") from None
+                line = text.readline(LONGEST_LINE + 1)
             except UnicodeDecodeError as error:
                 raise InputError(f"{path}: not {kind.what} (not UTF-8: {error.reason}); {kind.hint}") from None
             if not line:

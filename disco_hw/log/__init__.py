@@ -13,7 +13,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -56,7 +56,8 @@ class Start(msgspec.Struct, frozen=True):
     """Start of a log, all that a writer must know; wall-clock time is monotonic time plus `wall_offset_ns`.
 
     `path` is the first part's. A later part names the file that it continues, of which it is known that ticks up to
-    `continues_sequence` are in it.
+    `continues_sequence` are in it. It is also the request to the keeper process to start a writer on the attached
+    socket, then without attachments and scene, which the keeper has.
     """
 
     path: str
@@ -66,7 +67,7 @@ class Start(msgspec.Struct, frozen=True):
     wall_offset_ns: int
     part: int = 1
     continues: str = ""
-    continues_sequence: int = 0
+    continues_sequence: int | None = None
     attachments: tuple[Attachment, ...] = ()
     scene: TaskScene | None = None
     flush_s: float = 0.5
@@ -75,20 +76,10 @@ class Start(msgspec.Struct, frozen=True):
     planner: int = 0
 
 
-class Launch(msgspec.Struct, frozen=True):
-    """Request to the keeper process to start a writer on the attached socket."""
-
-    part: int
-    start_ns: int
-    continues: str
-    continues_sequence: int
-
-
 class Started(msgspec.Struct, frozen=True, tag=True):
-    """Report of the keeper process: process id of the newest writer, or 0 with the reason in `error`."""
+    """Report of the keeper process: process id of the newest writer, or 0 if none could be made, as its status says."""
 
     pid: int
-    error: str = ""
 
 
 class Ended(msgspec.Struct, frozen=True, tag=True):
@@ -98,11 +89,15 @@ class Ended(msgspec.Struct, frozen=True, tag=True):
     code: int
 
 
-class End(msgspec.Struct, frozen=True):
-    """The recorder's last word: the number of the last tick that it was given, and how many it had to drop."""
+Time64 = Annotated[int, msgspec.Meta(ge=-(2**63) + 1, le=2**63 - 1)]
+"""A time or an offset of times, ns, in the 64 bits that a log has for it."""
 
-    t_ns: int
-    sequence: int
+
+class End(msgspec.Struct, frozen=True):
+    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped."""
+
+    t_ns: Time64
+    sequence: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     dropped_ticks: int
 
 

@@ -199,16 +199,20 @@ def _of_one(log: DriveLog, radius_m: float, axial_m: float) -> tuple[Contradicti
     dead = dead_encoders(windows)
     if dead:
         return dead
-    poses = _Poses(log, windows, radius_m, axial_m)
     compared_with_commands = _of_commands(windows, commands)
     if compared_with_commands is None:
-        return poses.contradictions(has_commands=commands is not None)
+        return _of_poses(log, windows, radius_m, axial_m, has_commands=commands is not None)
     of_wheels, of_commands, as_commanded = compared_with_commands
-    if poses.fits(as_commanded):
+    if _is_explained(fit_body(as_commanded, radius_m, axial_m)):
         return (replace(of_wheels, message=f"{of_wheels.message} (the poses show it too)"),)
-    if poses.fits(windows):
+    if _is_explained(fit_body(windows, radius_m, axial_m)):
         return (of_commands,)
-    return (*poses.contradictions(has_commands=True), of_wheels)
+    return (*_of_poses(log, windows, radius_m, axial_m, has_commands=True), of_wheels)
+
+
+def _is_explained(fit: BodyFit | None) -> bool:
+    """Whether the wheels explain the poses with a geometry that the robot can have."""
+    return fit is not None and fit.worst < _UNEXPLAINED and fit.is_usual
 
 
 def _of_commands(
@@ -290,67 +294,50 @@ def _with_wheels(windows: MotionWindows, factors: Array, swap: bool = False) -> 
     return replace(windows, rolled_rad=rolled * factors)
 
 
-class _Poses:
-    """Judges the poses of a log beside its wheels, with the nominal geometry of the robot."""
+def _of_poses(
+    log: DriveLog, windows: MotionWindows, radius_m: float, axial_m: float, has_commands: bool
+) -> tuple[Contradiction, ...]:
+    """Return the contradictions between wheels and poses, the most likely cause first."""
+    if log.poses.t_s.size < 2:
+        return ()
+    apart = no_common_time(log) or standing(windows, radius_m, axial_m)
+    if apart is not None:
+        return (apart,)
+    fit = fit_body(windows, radius_m, axial_m)
+    if fit is None or (fit.worst < _WELL_EXPLAINED and fit.is_usual):
+        return ()
+    dead = None if has_commands else never_counting(windows)
+    cause = dead or of_units(fit) or _correction(log, windows, fit, radius_m, axial_m)
+    if cause is not None:
+        return (cause,)
+    if fit.worst > _UNEXPLAINED:
+        return (of_unrelated(fit),)
+    found = [of_axes(fit), of_scale(fit, radius_m)]
+    if fit.worst > _EXPLAINED and any(found):
+        return (of_unrelated(fit),)
+    return tuple(each for each in found if each is not None)
 
-    def __init__(self, log: DriveLog, windows: MotionWindows, radius_m: float, axial_m: float) -> None:
-        self._log = log
-        self._windows = windows
-        self._radius_m, self._axial_m = radius_m, axial_m
 
-    def fits(self, windows: MotionWindows) -> bool:
-        """Whether these wheels explain the poses with a geometry that the robot can have."""
-        fit = self._fit(windows)
-        return fit is not None and fit.worst < _UNEXPLAINED and fit.is_usual
-
-    def contradictions(self, has_commands: bool) -> tuple[Contradiction, ...]:
-        """Return the contradictions between wheels and poses, the most likely cause first."""
-        if self._log.poses.t_s.size < 2:
-            return ()
-        apart = no_common_time(self._log) or standing(self._windows, self._radius_m, self._axial_m)
-        if apart is not None:
-            return (apart,)
-        fit = self._fit(self._windows)
-        if fit is None or (fit.worst < _WELL_EXPLAINED and fit.is_usual):
-            return ()
-        dead = None if has_commands else never_counting(self._windows)
-        cause = dead or of_units(fit) or self._correction(fit)
-        if cause is not None:
-            return (cause,)
-        if fit.worst > _UNEXPLAINED:
-            return (of_unrelated(fit),)
-        found = [of_axes(fit), of_scale(fit, self._radius_m)]
-        if fit.worst > _EXPLAINED and any(found):
-            return (of_unrelated(fit),)
-        return tuple(each for each in found if each is not None)
-
-    def _fit(
-        self, windows: MotionWindows, factors: tuple[float, float] = (1.0, 1.0), mirrored: bool = False
-    ) -> BodyFit | None:
-        return fit_body(windows, self._radius_m, self._axial_m, factors, mirrored)
-
-    def _correction(self, fit: BodyFit) -> Contradiction | None:
-        """Return the one thing that, put right, lets the wheels explain the poses; None if there is none."""
-        good = min(_EXPLAINED, _AS_GOOD * fit.worst)
-        for factors, (cause, what) in _ENCODER_FAULTS.items():
-            other = self._fit(self._windows, factors)
-            reversed_count = min(factors) < 0.0
-            # On a steady circle a reversed encoder explains no better than a geometry that no robot has.
-            limit = _EXPLAINED if reversed_count and not fit.has_clear_axes else good
-            if other is not None and other.is_usual and other.worst < limit:
-                hint = (
-                    "set the sign of its ticks (link.direction)"
-                    if reversed_count
-                    else "check ticks_per_rev and gear there"
-                )
-                return Contradiction(cause, f"{what}, by the poses: {hint}", ("body", "response"))
-        mirrored = self._fit(self._windows, mirrored=True)
-        if mirrored is not None and mirrored.worst < good:
-            return _mirrored(mirrored)
-        clock = fit_pose_clock(self._log, self._radius_m, self._axial_m, only_offset=fit.worst < _UNEXPLAINED)
-        if clock is None or clock.fit.worst > good or not clock.fit.is_usual:
-            return None
-        return of_clock(clock) if clock.rate != 1.0 or abs(clock.later_s) > _LEAST_DELAY_S else None
+def _correction(
+    log: DriveLog, windows: MotionWindows, fit: BodyFit, radius_m: float, axial_m: float
+) -> Contradiction | None:
+    """Return the one thing that, put right, lets the wheels explain the poses; None if there is none."""
+    good = min(_EXPLAINED, _AS_GOOD * fit.worst)
+    for factors, (cause, what) in _ENCODER_FAULTS.items():
+        other = fit_body(windows, radius_m, axial_m, factors)
+        is_reversed = min(factors) < 0.0
+        # On a steady circle a reversed encoder explains no better than a geometry that no robot has.
+        limit = _EXPLAINED if is_reversed and not fit.has_clear_axes else good
+        if other is not None and other.is_usual and other.worst < limit:
+            hint = "set the sign of its ticks (link.direction)" if is_reversed else "check ticks_per_rev and gear there"
+            return Contradiction(cause, f"{what}, by the poses: {hint}", ("body", "response"))
+    mirrored = fit_body(windows, radius_m, axial_m, mirrored=True)
+    if mirrored is not None and mirrored.worst < good:
+        return _mirrored(mirrored)
+    clock = fit_pose_clock(log, radius_m, axial_m, only_offset=fit.worst < _UNEXPLAINED)
+    if clock is None or clock.fit.worst > good or not clock.fit.is_usual:
+        return None
+    return of_clock(clock) if clock.rate != 1.0 or abs(clock.later_s) > _LEAST_DELAY_S else None
 
 
 def _mirrored(fit: BodyFit) -> Contradiction:

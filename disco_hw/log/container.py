@@ -32,14 +32,15 @@ from mcap.records import (
     Schema,
     Statistics,
 )
+from mcap.records import Message as McapMessage
+from mcap.writer import Writer
 
 from disco_hw.errors import LogError
 
 MAGIC = b"\x89MCAP0\r\n"
 
 _HEAD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_COMPLETE_MESSAGE = struct.Struct("<BQHIQQ")
+_MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_OPCODE = int(Opcode.MESSAGE)
 _FOOTER_BYTES = _HEAD.size + 8 + 8 + 4
 # Largest offset of a file (int64 of POSIX).
@@ -54,6 +55,14 @@ _SEARCH_BYTES = 1024 * 1024
 _CHUNK_MARK = b"\x04\x00\x00\x00zstd"
 _CHUNK_MARK_AT = _HEAD.size + 8 + 8 + 8 + 4
 _FRONT_MATTER = (Opcode.ATTACHMENT, Opcode.METADATA, Opcode.HEADER)
+_DESCRIPTIONS: dict[int, type[object]] = {
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.STATISTICS: Statistics,
+    Opcode.CHUNK_INDEX: ChunkIndex,
+    Opcode.ATTACHMENT_INDEX: AttachmentIndex,
+    Opcode.METADATA_INDEX: MetadataIndex,
+}
 _PARSE_ERRORS = (McapError, struct.error, ValueError, KeyError, OverflowError, zstandard.ZstdError)
 _T = TypeVar("_T")
 
@@ -82,18 +91,6 @@ class ChunkRef:
     end_time: int
 
 
-@dataclass(frozen=True, slots=True)
-class AttachmentRef:
-    """Position of an attachment's record in the file, its name and type."""
-
-    offset: int
-    length: int
-    log_time: int
-    name: str
-    media_type: str
-    size: int
-
-
 @dataclass(slots=True)
 class Contents:
     """Contents of an MCAP file: its index of schemas, channels, chunks, attachments and metadata.
@@ -107,7 +104,7 @@ class Contents:
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     chunks: list[ChunkRef] = field(default_factory=list)
-    attachments: list[AttachmentRef] = field(default_factory=list)
+    attachments: list[AttachmentIndex] = field(default_factory=list)
     metadata: list[Metadata] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
     damage: list[str] = field(default_factory=list)
@@ -135,40 +132,32 @@ def _walked(fd: int, size: int) -> tuple[Contents, bool]:
     After damage it goes on with the next whole chunk.
     """
     contents = Contents(size=size)
-    offset, unlisted = len(MAGIC), 0
-    while offset < size:
+    offset, unlisted, ended = len(MAGIC), 0, False
+    while offset < size and not ended:
         head = _read(fd, offset, _HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         follows = offset + _HEAD.size + length
-        if opcode == Opcode.DATA_END:
-            return _with_unlisted(contents, unlisted), True
-        damage_text = ""
-        if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
-            damage_text = "no record"
-        elif follows > size:
-            damage_text = "an unfinished record"
-        else:
-            try:
-                _index_record(fd, contents, opcode, offset + _HEAD.size, length)
-            except DamagedError as damage:
-                damage_text = str(damage)
-        if damage_text and (opcode not in _FRONT_MATTER or follows > size):
-            # Of a damaged chunk the length is in doubt as well.
-            follows = _next_chunk(fd, offset + 1, size) or size
-        if damage_text and len(contents.damage) < _MOST_DAMAGE:
-            contents.damage.append(f"at byte {offset}: {damage_text}; {follows - offset} bytes are lost")
-        elif damage_text:
-            unlisted += 1
+        ended = opcode == Opcode.DATA_END
+        try:
+            if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+                raise DamagedError("no record")
+            if follows > size and not ended:
+                raise DamagedError("an unfinished record")
+            _index_record(fd, contents, opcode, offset, length)
+        except DamagedError as damage:
+            if opcode not in _FRONT_MATTER or follows > size:
+                # Of a damaged chunk the length is in doubt as well.
+                follows = _next_chunk(fd, offset + 1, size) or size
+            if len(contents.damage) < _MOST_DAMAGE:
+                contents.damage.append(f"at byte {offset}: {damage}; {follows - offset} bytes are lost")
+            else:
+                unlisted += 1
         offset = follows
-    _with_unlisted(contents, unlisted)
-    contents.damage.append("the end is missing: the writer was killed or is still at work, or the file was cut")
-    return contents, False
-
-
-def _with_unlisted(contents: Contents, count: int) -> Contents:
-    if count:
-        contents.damage.append(f"at {count} further places something is lost")
-    return contents
+    if unlisted:
+        contents.damage.append(f"at {unlisted} further places something is lost")
+    if not ended:
+        contents.damage.append("the end is missing: the writer was killed or is still at work, or the file was cut")
+    return contents, ended
 
 
 def _next_chunk(fd: int, start: int, size: int) -> int | None:
@@ -207,12 +196,13 @@ def read_chunk(fd: int, chunk: ChunkRef) -> bytes:
     return data
 
 
-def read_attachment(fd: int, attachment: AttachmentRef) -> bytes:
+def read_attachment(fd: int, index: AttachmentIndex) -> bytes:
     """Return the bytes of an attachment, checked against its CRC; raises DamagedError."""
-    return bytes(_checked_attachment(_content(fd, attachment.offset, attachment.length)).data)
+    return bytes(_attachment(fd, index.offset, index.length - _HEAD.size).data)
 
 
-def _checked_attachment(content: bytes) -> Attachment:
+def _attachment(fd: int, offset: int, length: int) -> Attachment:
+    content = _content(fd, offset + _HEAD.size, length)
     record = _parse(Attachment, content)
     crc = int.from_bytes(content[-4:], "little")
     if crc and zlib.crc32(content[:-4]) != crc:
@@ -223,8 +213,8 @@ def _checked_attachment(content: bytes) -> Attachment:
 def messages(chunk_data: bytes, channels: Collection[int] | None = None) -> Iterator[Message]:
     """Yield the messages in a chunk's data, of the wanted channels or of all, in file order; raises DamagedError."""
     # Runs for every message of a log, so its head and its content's head are unpacked at once.
-    offset, size, header = 0, len(chunk_data), _COMPLETE_MESSAGE.size
-    unpack = _COMPLETE_MESSAGE.unpack_from
+    offset, size, header = 0, len(chunk_data), _MESSAGE.size
+    unpack = _MESSAGE.unpack_from
     while size - offset >= header:
         opcode, length, channel_id, sequence, log_time, publish_time = unpack(chunk_data, offset)
         begin, offset = offset, offset + _HEAD.size + length
@@ -242,6 +232,34 @@ def messages(chunk_data: bytes, channels: Collection[int] | None = None) -> Iter
             raise DamagedError("a message that is too short")
 
 
+class McapCopy:
+    """Copies the schemas, channels and messages of one MCAP file to a new one; a channel without schema keeps none."""
+
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
+        self._schemas: dict[int, int] = {}
+        self._channels: dict[int, int] = {}
+
+    def describe(self, record: Schema | Channel) -> None:
+        """Copy a schema or channel, of several with one number the first; schemas come before their channels."""
+        if isinstance(record, Schema):
+            if record.id not in self._schemas:
+                self._schemas[record.id] = self._writer.register_schema(record.name, record.encoding, record.data)
+        elif record.id not in self._channels:
+            schema = self._schemas.get(record.schema_id, 0)
+            self._channels[record.id] = self._writer.register_channel(
+                record.topic, record.message_encoding, schema, record.metadata
+            )
+
+    def add(self, message: Message | McapMessage) -> bool:
+        """Copy a message; False for one of a channel that nothing describes."""
+        channel = self._channels.get(message.channel_id)
+        if channel is None:
+            return False
+        self._writer.add_message(channel, message.log_time, message.data, message.publish_time, message.sequence)
+        return True
+
+
 def _inner(data: bytes, offset: int = 0) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the content of each record from `offset` on."""
     size = len(data)
@@ -254,6 +272,14 @@ def _inner(data: bytes, offset: int = 0) -> Iterator[tuple[int, int, int]]:
             raise DamagedError("a record that reaches beyond its chunk")
         offset = start + length
         yield opcode, start, offset
+
+
+def _records(data: bytes) -> Iterator[object]:
+    """Yield what a chunk or an index says of the log, as the library parses it; raises DamagedError."""
+    for opcode, start, end in _inner(data):
+        kind = _DESCRIPTIONS.get(opcode)
+        if kind is not None:
+            yield _parse(kind, data[start:end])
 
 
 def _indexed(fd: int, size: int) -> Contents:
@@ -272,72 +298,52 @@ def _indexed(fd: int, size: int) -> Contents:
     if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamagedError("an index with a wrong checksum")
     contents = Contents(size=size, complete=True)
-    statistics: Statistics | None = None
-    for opcode, start, end in _inner(summary):
-        content = summary[start:end]
-        if opcode == Opcode.SCHEMA:
-            schema = _parse(Schema, content)
-            contents.schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = _parse(Channel, content)
-            contents.channels[channel.id] = channel
-        elif opcode == Opcode.STATISTICS:
-            statistics = _parse(Statistics, content)
-        elif opcode == Opcode.CHUNK_INDEX:
-            chunk = _parse(ChunkIndex, content)
-            offset, length = chunk.chunk_start_offset + _HEAD.size, chunk.chunk_length - _HEAD.size
-            contents.chunks.append(ChunkRef(offset, length, chunk.message_start_time, chunk.message_end_time))
-        elif opcode == Opcode.ATTACHMENT_INDEX:
-            kept = _parse(AttachmentIndex, content)
-            offset, length = kept.offset + _HEAD.size, kept.length - _HEAD.size
-            contents.attachments.append(
-                AttachmentRef(offset, length, kept.log_time, kept.name, kept.media_type, kept.data_size)
-            )
-        elif opcode == Opcode.METADATA_INDEX:
-            about = _parse(MetadataIndex, content)
-            contents.metadata.append(
-                _parse(Metadata, _content(fd, about.offset + _HEAD.size, about.length - _HEAD.size))
-            )
-    if statistics is None or not contents.chunks:
+    has_counts = False
+    for record in _records(summary):
+        match record:
+            case Schema():
+                contents.schemas[record.id] = record
+            case Channel():
+                contents.channels[record.id] = record
+            case Statistics():
+                contents.counts.update(record.channel_message_counts)
+                has_counts = True
+            case ChunkIndex():
+                offset, length = record.chunk_start_offset + _HEAD.size, record.chunk_length - _HEAD.size
+                contents.chunks.append(ChunkRef(offset, length, record.message_start_time, record.message_end_time))
+            case AttachmentIndex():
+                contents.attachments.append(record)
+            case MetadataIndex():
+                content = _content(fd, record.offset + _HEAD.size, record.length - _HEAD.size)
+                contents.metadata.append(_parse(Metadata, content))
+    if not has_counts or not contents.chunks:
         raise DamagedError("an index without chunks")
-    contents.counts.update(statistics.channel_message_counts)
     return contents
 
 
 def _index_record(fd: int, contents: Contents, opcode: int, offset: int, length: int) -> None:
-    """Note one top-level record; raises DamagedError."""
+    """Note the top-level record at `offset`, whose content has this length; raises DamagedError."""
     if opcode == Opcode.CHUNK:
-        _index_chunk(fd, contents, offset, length)
+        _index_chunk(fd, contents, offset + _HEAD.size, length)
     elif opcode == Opcode.ATTACHMENT:
-        record = _checked_attachment(_content(fd, offset, length))
+        kept = _attachment(fd, offset, length)
         contents.attachments.append(
-            AttachmentRef(offset, length, record.log_time, record.name, record.media_type, len(record.data))
+            AttachmentIndex(
+                offset, length + _HEAD.size, kept.log_time, kept.create_time, len(kept.data), kept.name, kept.media_type
+            )
         )
     elif opcode == Opcode.METADATA:
-        contents.metadata.append(_parse(Metadata, _content(fd, offset, length)))
+        contents.metadata.append(_parse(Metadata, _content(fd, offset + _HEAD.size, length)))
 
 
 def _index_chunk(fd: int, contents: Contents, offset: int, length: int) -> None:
-    chunk = ChunkRef(offset, length, 0, 0)
-    data = read_chunk(fd, chunk)
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    for opcode, start, end in _inner(data):
-        if opcode == Opcode.SCHEMA:
-            schema = _parse(Schema, data[start:end])
-            schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = _parse(Channel, data[start:end])
-            channels[channel.id] = channel
-    counts = Counter[int]()
-    first, last = 0, 0
-    for message in messages(data):
-        first = message.log_time if not counts else first
-        last = message.log_time
-        counts[message.channel_id] += 1
-    contents.schemas.update(schemas)
-    contents.channels.update(channels)
-    contents.counts.update(counts)
+    data = read_chunk(fd, ChunkRef(offset, length, 0, 0))
+    records = list(_records(data))
+    heads = [(message.channel_id, message.log_time) for message in messages(data)]
+    first, last = (heads[0][1], heads[-1][1]) if heads else (0, 0)
+    contents.schemas.update({record.id: record for record in records if isinstance(record, Schema)})
+    contents.channels.update({record.id: record for record in records if isinstance(record, Channel)})
+    contents.counts.update(channel_id for channel_id, _ in heads)
     contents.chunks.append(ChunkRef(offset, length, first, last))
 
 

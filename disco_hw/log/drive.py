@@ -5,9 +5,9 @@ Poses may come as chains of transforms: what /tf and /tf_static say between fram
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +21,19 @@ LONGEST_SILENCE_NS = 500_000_000
 """A longer pause of the wheels begins a new segment."""
 LONGEST_COMMAND_S = 0.5
 """How long a command of a log that does not say is in force at most."""
-_WHEEL_COLUMNS = {
-    "enc_left_rad_s": "left_speed_rad_s",
-    "enc_right_rad_s": "right_speed_rad_s",
-    "enc_left_rad": "left_angle_rad",
-    "enc_right_rad": "right_angle_rad",
+_CSV_NAMES = {
+    "left_rad_s": "cmd_left_rad_s",
+    "right_rad_s": "cmd_right_rad_s",
+    "left_speed_rad_s": "enc_left_rad_s",
+    "right_speed_rad_s": "enc_right_rad_s",
+    "left_angle_rad": "enc_left_rad",
+    "right_angle_rad": "enc_right_rad",
+    "x_m": "pose_x_m",
+    "y_m": "pose_y_m",
+    "yaw_rad": "pose_yaw_rad",
+    "yaw_rate_rad_s": "imu_wz_rad_s",
 }
+_PARTS = ("commands", "wheels", "poses", "gyro")
 
 
 def _no_values() -> Array:
@@ -85,19 +92,13 @@ class Gyro:
     segment: Index = field(default_factory=_no_segments)
 
 
+Part = Commands | Wheels | Poses | Gyro
+PartT = TypeVar("PartT", Commands, Wheels, Poses, Gyro)
+
+
 def after_silences(wheel_ns: NDArray[Any]) -> NDArray[Any]:
     """Return the times (ns) of wheel samples after a silence: what was driven meanwhile is not known."""
     return wheel_ns[1:][np.diff(wheel_ns) > LONGEST_SILENCE_NS]
-
-
-def in_segments(begin_ns: float, breaks_ns: NDArray[Any]) -> Callable[[NDArray[Any]], tuple[Array, Index]]:
-    """Return a function that gives for times (ns) the seconds since `begin_ns` and the segments between breaks."""
-
-    def when(t_ns: NDArray[Any]) -> tuple[Array, Index]:
-        seconds = (t_ns - begin_ns).astype(np.float64) * 1e-9
-        return seconds, np.searchsorted(breaks_ns, t_ns, side="right").astype(np.int64)
-
-    return when
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,14 +121,16 @@ class DriveLog:
     @property
     def end_s(self) -> float:
         """The last time in any array; 0 for an empty log."""
-        times = (self.commands.t_s, self.wheels.t_s, self.poses.t_s, self.gyro.t_s)
-        return max((float(t[-1]) for t in times if t.size), default=0.0)
+        return max((float(part.t_s[-1]) for part in self._parts if part.t_s.size), default=0.0)
 
     @property
     def segments(self) -> int:
         """Return the number of segments: one more than the highest index in any array."""
-        arrays = (self.commands.segment, self.wheels.segment, self.poses.segment, self.gyro.segment)
-        return 1 + max((int(segment.max()) for segment in arrays if segment.size), default=-1)
+        return 1 + max((int(part.segment.max()) for part in self._parts if part.t_s.size), default=-1)
+
+    @property
+    def _parts(self) -> tuple[Part, ...]:
+        return self.commands, self.wheels, self.poses, self.gyro
 
     def to_pandas(self) -> Any:
         """Return the drive as one `pandas.DataFrame`, a row a sample in order of time, with our CSV's columns.
@@ -137,65 +140,106 @@ class DriveLog:
         """
         import pandas  # noqa: PLC0415
 
-        frames = [pandas.DataFrame(columns) for columns in self._tables() if columns["t_s"].size]
+        tables = []
+        for columns in map(_columns, self._parts):
+            named = {csv_name: columns[name] for name, csv_name in _CSV_NAMES.items() if name in columns}
+            tables.append({"t_s": columns["t_s"], "segment": columns["segment"], **named})
+        frames = [pandas.DataFrame(table) for table in tables if table["t_s"].size]
         if not frames:
-            return pandas.DataFrame({name: np.empty(0) for columns in self._tables() for name in columns})
+            return pandas.DataFrame({name: np.empty(0) for table in tables for name in table})
         joined = pandas.concat(frames, ignore_index=True)
         return joined.sort_values("t_s", kind="stable", ignore_index=True)
 
-    def _tables(self) -> list[dict[str, NDArray[Any]]]:
-        of: list[tuple[Commands | Wheels | Poses | Gyro, dict[str, str]]] = [
-            (self.commands, {"cmd_left_rad_s": "left_rad_s", "cmd_right_rad_s": "right_rad_s"}),
-            (self.wheels, _WHEEL_COLUMNS),
-            (self.poses, {"pose_x_m": "x_m", "pose_y_m": "y_m", "pose_yaw_rad": "yaw_rad"}),
-            (self.gyro, {"imu_wz_rad_s": "yaw_rate_rad_s"}),
-        ]
-        return [
-            {"t_s": part.t_s, "segment": part.segment, **{name: getattr(part, field) for name, field in names.items()}}
-            for part, names in of
-        ]
+
+def _columns(part: Part) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a part by name."""
+    return {name: getattr(part, name) for name in part.__slots__ if not name.endswith("measured")}
+
+
+def chosen(part: PartT, which: NDArray[np.bool_]) -> PartT:
+    """Return the samples of a part that are marked (N,)."""
+    columns: dict[str, Any] = {name: column[which] for name, column in _columns(part).items()}
+    return replace(part, **columns)
+
+
+def rows(part: Part) -> Iterator[tuple[Any, ...]]:
+    """Yield the samples of a part as tuples of plain numbers, in the order of its fields: time first, segment last."""
+    return zip(*(column.tolist() for column in _columns(part).values()), strict=True)
+
+
+Samples = tuple[NDArray[Any], Array]
+"""Times (N,), ns, and values (N, k)."""
+
+
+def drive_of(
+    source: str,
+    commands: Samples,
+    wheels: Samples,
+    poses: Samples,
+    breaks_ns: NDArray[Any] | None = None,
+    measured: tuple[bool, bool] = (True, True),
+    notes: Sequence[str] = (),
+) -> DriveLog:
+    """Return a drive of left and right commands (N, 2), wheel angles before speeds (N, 4), and x, y, yaw (N, 3).
+
+    Time 0 is the first sample's; there has to be one. New segments begin at `breaks_ns`, by default where the wheels
+    were silent. Whichever of wheel angles and speeds is not `measured` is derived from the other.
+    """
+    began_ns = min(t_ns[0] for t_ns, _ in (commands, wheels, poses) if t_ns.size)
+    breaks = after_silences(wheels[0]) if breaks_ns is None else breaks_ns
+
+    def when(t_ns: NDArray[Any]) -> tuple[Array, Index]:
+        seconds = (t_ns - began_ns).astype(np.float64) * 1e-9
+        return seconds, np.searchsorted(breaks, t_ns, side="right").astype(np.int64)
+
+    (command_s, command_segment), (wheel_s, segment), (pose_s, pose_segment) = map(
+        when, (commands[0], wheels[0], poses[0])
+    )
+    left, right, left_speed, right_speed = wheels[1].T
+    has_angle, has_speed = (each and bool(wheel_s.size) for each in measured)
+    if not has_angle:
+        left, right = (integrate_angle(wheel_s, speed, segment) for speed in (left_speed, right_speed))
+    if not has_speed:
+        left_speed, right_speed = (differentiate_angle(wheel_s, angle, segment) for angle in (left, right))
+    return DriveLog(
+        sources=(source,),
+        commands=Commands(command_s, commands[1][:, 0], commands[1][:, 1], command_segment),
+        wheels=Wheels(wheel_s, left, right, left_speed, right_speed, segment, has_angle, has_speed),
+        poses=Poses(pose_s, poses[1][:, 0], poses[1][:, 1], poses[1][:, 2], pose_segment),
+        notes=tuple(notes),
+    )
 
 
 def concatenate(drives: Sequence[DriveLog]) -> DriveLog:
     """Drives one after the other, later ones shifted in time, their segments numbered on; at least one is needed."""
-    shifts, firsts = [], []
-    shift_s, first = 0.0, 0
-    for drive in drives:
-        shifts.append(shift_s)
-        firsts.append(first)
-        shift_s += drive.end_s + _BETWEEN_LOGS_S
-        first += drive.segments
+    shifts_s = np.cumsum([0.0, *(drive.end_s + _BETWEEN_LOGS_S for drive in drives[:-1])])
+    firsts = np.cumsum([0, *(drive.segments for drive in drives[:-1])])
 
-    def joined(name: str, field: str) -> Array:
-        arrays = [getattr(getattr(drive, name), field) for drive in drives]
-        if field == "t_s":
-            arrays = [array + shift for array, shift in zip(arrays, shifts, strict=True)]
-        return np.concatenate(arrays)
-
-    def segments(name: str) -> Index:
-        pairs = zip(drives, firsts, strict=True)
-        return np.concatenate([getattr(drive, name).segment + first for drive, first in pairs])
-
-    def fields(name: str, *names: str) -> dict[str, Array]:
-        return {field: joined(name, field) for field in ("t_s", *names)}
+    def joined(name: str) -> dict[str, NDArray[Any]]:
+        parts = [_columns(getattr(drive, name)) for drive in drives]
+        columns = {field: np.concatenate([part[field] for part in parts]) for field in parts[0]}
+        sizes = [part["t_s"].size for part in parts]
+        shifted = {"t_s": columns["t_s"] + np.repeat(shifts_s, sizes)}
+        return columns | shifted | {"segment": columns["segment"] + np.repeat(firsts, sizes)}
 
     # A drive without wheels says nothing about how wheels were measured, unless there is no other.
     rolling = [drive.wheels for drive in drives if drive.wheels.t_s.size] or [drive.wheels for drive in drives]
-    angles = ("left_angle_rad", "right_angle_rad")
-    speeds = ("left_speed_rad_s", "right_speed_rad_s")
     return DriveLog(
         sources=tuple(source for drive in drives for source in drive.sources),
-        commands=Commands(**fields("commands", "left_rad_s", "right_rad_s"), segment=segments("commands")),
+        commands=Commands(**joined("commands")),
         wheels=Wheels(
-            **fields("wheels", *angles, *speeds),
-            segment=segments("wheels"),
+            **joined("wheels"),
             angle_measured=all(wheels.angle_measured for wheels in rolling),
             speed_measured=all(wheels.speed_measured for wheels in rolling),
         ),
-        poses=Poses(**fields("poses", "x_m", "y_m", "yaw_rad"), segment=segments("poses")),
-        gyro=Gyro(**fields("gyro", "yaw_rate_rad_s"), segment=segments("gyro")),
+        poses=Poses(**joined("poses")),
+        gyro=Gyro(**joined("gyro")),
         notes=tuple(note for drive in drives for note in drive.notes),
-        begins_s=tuple(shift + begin for drive, shift in zip(drives, shifts, strict=True) for begin in drive.begins_s),
+        begins_s=tuple(
+            shift_s + begin
+            for drive, shift_s in zip(drives, shifts_s.tolist(), strict=True)
+            for begin in drive.begins_s
+        ),
     )
 
 
@@ -214,11 +258,10 @@ def _between(drive: DriveLog, source: str, begin_s: float, end_s: float) -> Driv
     if len(drive.begins_s) == 1:
         return drive
     parts: dict[str, Any] = {}
-    for name in ("commands", "wheels", "poses", "gyro"):
+    for name in _PARTS:
         part = getattr(drive, name)
-        inside = (part.t_s >= begin_s) & (part.t_s < end_s)
-        arrays = {field: getattr(part, field)[inside] for field in part.__slots__ if not field.endswith("measured")}
-        parts[name] = replace(part, **(arrays | {"t_s": arrays["t_s"] - begin_s}))
+        inside = chosen(part, (part.t_s >= begin_s) & (part.t_s < end_s))
+        parts[name] = replace(inside, t_s=inside.t_s - begin_s)
     return replace(drive, sources=(source,), begins_s=(0.0,), **parts)
 
 

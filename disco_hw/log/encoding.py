@@ -95,29 +95,19 @@ def _decoded(decoder: msgspec.json.Decoder[_R], data: bytes) -> _R:
         raise msgspec.DecodeError(f"not UTF-8: {error.reason}") from None
 
 
-def _integers(record_type: type) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the fields that are integers, and that map to them."""
-    hints = get_type_hints(record_type)
-    return (
-        tuple(name for name, hint in hints.items() if hint is int),
-        tuple(name for name, hint in hints.items() if hint == dict[str, int]),
-    )
-
-
-_INTEGERS: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    record: _integers(record) for record in (PlanFigures, *(topic.record for topic in TOPICS))
+_INTEGERS: dict[type, tuple[str, ...]] = {
+    record: tuple(name for name, hint in get_type_hints(record).items() if hint in (int, dict[str, int]))
+    for record in (PlanFigures, *(topic.record for topic in TOPICS))
 }
+"""Names of the fields that are integers, or map names to them."""
 
 
 def _within_64_bits(record: _R) -> _R:
     """Return the record, if every integer of it has a place in an array of numpy's; raises OverflowError."""
-    plain, mapped = _INTEGERS[type(record)]
-    for name in plain:
-        if not -_LIMIT <= getattr(record, name) < _LIMIT:
-            raise OverflowError(name)
-    for name in mapped:
-        for value in getattr(record, name).values():
-            if not -_LIMIT <= value < _LIMIT:
+    for name in _INTEGERS[type(record)]:
+        value = getattr(record, name)
+        for one in value.values() if isinstance(value, dict) else (value,):
+            if not -_LIMIT <= one < _LIMIT:
                 raise OverflowError(name)
     return record
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, begin_of, parse_toml
 from disco_hw.log import ROBOT_TOML
 from disco_hw.log.container import MAGIC
-from disco_hw.log.drive import Array, Commands, DriveLog, Index, Poses, Wheels, after_silences, concatenate, in_segments
+from disco_hw.log.drive import Array, DriveLog, Index, after_silences, concatenate, drive_of
 from disco_hw.log.importing.csv_drive import read_csv
 from disco_hw.log.importing.losses import with_headings_only, without_standing_headings
 from disco_hw.log.importing.rosbag_file import is_bag
@@ -40,46 +41,21 @@ def drive_from_log(log: Log) -> DriveLog:
         notes,
     )
     pose_ns, pose = _poses(log, notes)
-    starts = [int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size]
-    if not starts:
+    if not (command_ns.size or wheel_ns.size or pose_ns.size):
         raise LogError(f"{log.path}: holds no command, wheel sample or pose; nothing was driven in it")
-    when = in_segments(min(starts), _breaks(log, wheel_ns, notes))
-    command_s, command_segment = when(command_ns)
-    wheel_s, wheel_segment = when(wheel_ns)
-    pose_s, pose_segment = when(pose_ns)
-    left_angle, right_angle, left_speed, right_speed = wheel.T
-    x_m, y_m, yaw_rad = pose.T
-    measured = bool(wheel_s.size)
-    return DriveLog(
-        sources=(str(log.path),),
-        commands=Commands(command_s, speeds[:, 0], speeds[:, 1], command_segment),
-        wheels=Wheels(wheel_s, left_angle, right_angle, left_speed, right_speed, wheel_segment, measured, measured),
-        poses=Poses(pose_s, x_m, y_m, yaw_rad, pose_segment),
-        notes=tuple(notes),
-    )
+    breaks_ns = _breaks(log, wheel_ns, notes)
+    return drive_of(str(log.path), (command_ns, speeds), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, notes=notes)
 
 
-def ticks_per_rev(log: Log) -> int | None:
-    """Return the encoder ticks per wheel revolution from the configuration kept in the log, or None."""
+def nominal_robot(log: Log) -> dict[str, float]:
+    """Numbers of [robot] in the configuration kept in the log, where they are positive; empty without one."""
     if ROBOT_TOML not in log.attachment_names():
-        return None
-    try:
-        value = parse_toml(log.attachment(ROBOT_TOML), ROBOT_TOML)["robot"]["ticks_per_rev"]
-    except (InputError, KeyError, TypeError):
-        return None
-    return value if isinstance(value, int) and value > 0 else None
-
-
-def nominal_geometry(log: Log) -> tuple[float, float] | None:
-    """Nominal wheel radius and axial distance (m) from the configuration kept in the log, or None."""
-    if ROBOT_TOML not in log.attachment_names():
-        return None
+        return {}
     try:
         robot = parse_toml(log.attachment(ROBOT_TOML), ROBOT_TOML)["robot"]
-        radius_m, axial_m = float(robot["wheel_radius_m"]), float(robot["axial_distance_m"])
-    except (InputError, KeyError, TypeError, ValueError):
-        return None
-    return (radius_m, axial_m) if radius_m > 0.0 and axial_m > 0.0 else None
+        return {name: value for name, value in robot.items() if isinstance(value, int | float) and value > 0}
+    except (InputError, KeyError, AttributeError):
+        return {}
 
 
 def _columns(log: Log, topic: str) -> dict[str, NDArray[np.generic]]:
@@ -176,7 +152,7 @@ def load_drive(
     if not several:
         raise LogError("no log given; give at least one")
     for place, path in enumerate(several):
-        if any(_same(path, other) for other in several[:place]):
+        if os.path.realpath(path) in map(os.path.realpath, several[:place]):
             raise LogError(f"{path}: given twice, so that its data would count twice; give each log once")
     drives = [_load(path, ticks_per_rev, wheel_radius_m) for path in several]
     if len(drives) > 1:
@@ -199,13 +175,6 @@ def _marks(drive: DriveLog) -> set[tuple[float, ...]]:
     since_us = np.rint(np.diff(poses.t_s) * 1e6)
     columns = (since_us, poses.x_m[1:], poses.y_m[1:], poses.yaw_rad[1:])
     return set(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _same(path: Path, other: Path) -> bool:
-    try:
-        return path.samefile(other)
-    except OSError:
-        return False
 
 
 def _load(path: Path, ticks_per_rev: float | None, wheel_radius_m: float | None) -> DriveLog:

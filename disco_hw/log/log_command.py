@@ -18,10 +18,18 @@ from mcap.writer import CompressionType, Writer
 
 from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, open_file
-from disco_hw.log.container import Contents, DamagedError, messages, read_attachment, read_chunk, read_contents
-from disco_hw.log.drive import DriveLog
+from disco_hw.log.container import (
+    Contents,
+    DamagedError,
+    McapCopy,
+    messages,
+    read_attachment,
+    read_chunk,
+    read_contents,
+)
+from disco_hw.log.drive import DriveLog, rows
 from disco_hw.log.importing.csv_drive import write_csv
-from disco_hw.log.load import drive_from_log, nominal_geometry, ticks_per_rev
+from disco_hw.log.load import drive_from_log, nominal_robot
 from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.records import Controller
@@ -53,10 +61,9 @@ def export(path: Path, out: Path, as_json: bool) -> str:
     """Write commands, encoders and poses of a log as CSV; raises LogError."""
     with open_log(path) as log:
         drive = drive_from_log(log)
-        rows = write_csv(drive, out, ticks_per_rev(log))
-    if as_json:
-        return json.dumps({"out": str(out), "rows": rows, "segments": drive.segments, "notes": drive.notes})
-    return "\n".join([f"{out}: {rows} rows, {drive.segments} segment{'s' * (drive.segments != 1)}", *drive.notes])
+        ticks_per_rev = nominal_robot(log).get("ticks_per_rev")
+        count = write_csv(drive, out, ticks_per_rev if isinstance(ticks_per_rev, int) else None)
+    return _exported(out, "rows", count, drive, as_json)
 
 
 def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
@@ -65,12 +72,17 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
         drive = drive_from_log(log)
         times = (log.columns(topic).get("t_ns") for topic in ("/command", "/wheels", "/pose"))
         first_ns = min(int(t_ns.min()) for t_ns in times if t_ns is not None and t_ns.size)
-        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, nominal_geometry(log))
+        robot = nominal_robot(log)
+        radius_m, axial_m = robot.get("wheel_radius_m"), robot.get("axial_distance_m")
+        geometry = None if radius_m is None or axial_m is None else (radius_m, axial_m)
+        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, geometry)
+    return _exported(out, "messages", messages, drive, as_json)
+
+
+def _exported(out: Path, what: str, count: int, drive: DriveLog, as_json: bool) -> str:
     if as_json:
-        return json.dumps({"out": str(out), "messages": messages, "segments": drive.segments, "notes": drive.notes})
-    return "\n".join(
-        [f"{out}: {messages} messages, {drive.segments} segment{'s' * (drive.segments != 1)}", *drive.notes]
-    )
+        return json.dumps({"out": str(out), what: count, "segments": drive.segments, "notes": drive.notes})
+    return "\n".join([f"{out}: {count} {what}, {drive.segments} segment{'s' * (drive.segments != 1)}", *drive.notes])
 
 
 def _controller(record: Controller) -> str:
@@ -168,16 +180,11 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
             attachments += 1
         except DamagedError as damage:
             all_damage.append(str(damage))
-    schemas = {
-        schema.id: writer.register_schema(schema.name, schema.encoding, schema.data)
-        for schema in contents.schemas.values()
-    }
-    channels = {
-        channel.id: writer.register_channel(
-            channel.topic, channel.message_encoding, schemas.get(channel.schema_id, 0), channel.metadata
-        )
-        for channel in contents.channels.values()
-    }
+    copy = McapCopy(writer)
+    for schema in contents.schemas.values():
+        copy.describe(schema)
+    for channel in contents.channels.values():
+        copy.describe(channel)
     count, chunks = 0, 0
     for chunk in contents.chunks:
         try:
@@ -186,16 +193,7 @@ def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
             all_damage.append(f"at byte {chunk.offset}: {damage}; {chunk.length} bytes are lost")
             continue
         chunks += 1
-        for message in found:
-            if message.channel_id in channels:
-                writer.add_message(
-                    channels[message.channel_id],
-                    message.log_time,
-                    message.data,
-                    message.publish_time,
-                    message.sequence,
-                )
-                count += 1
+        count += sum(map(copy.add, found))
     writer.add_metadata(RECOVERY, {"source": name, "lost": "\n".join(all_damage)})
     writer.finish()  # type: ignore[no-untyped-call]
     return Recovered(count, chunks, attachments, tuple(all_damage))
@@ -258,15 +256,12 @@ class _Messages:
         return merge(*parts, key=lambda one: one[0])
 
     def _commands(self, drive: DriveLog) -> Iterator[_Timed]:
-        part = drive.commands
-        for t_s, left, right in zip(part.t_s.tolist(), part.left_rad_s, part.right_rad_s, strict=True):
-            speeds = [] if math.isnan(left) else [left, right]
-            yield self._joints(t_s, COMMAND_TOPIC, [], speeds)
+        for t_s, left, right, _ in rows(drive.commands):
+            yield self._joints(t_s, COMMAND_TOPIC, [], [] if math.isnan(left) else [left, right])
 
     def _twists(self, drive: DriveLog, radius_m: float, axial_m: float) -> Iterator[_Timed]:
-        part = drive.commands
         vector = self._types["geometry_msgs/msg/Vector3"]
-        for t_s, left, right in zip(part.t_s.tolist(), part.left_rad_s, part.right_rad_s, strict=True):
+        for t_s, left, right, _ in rows(drive.commands):
             if math.isnan(left):
                 continue
             forward = vector(0.5 * radius_m * (left + right), 0.0, 0.0)
@@ -276,15 +271,11 @@ class _Messages:
             yield t_ns, TWIST_TOPIC, self._types["geometry_msgs/msg/TwistStamped"](header, twist)
 
     def _wheels(self, drive: DriveLog) -> Iterator[_Timed]:
-        part = drive.wheels
-        columns = (part.t_s, part.left_angle_rad, part.right_angle_rad, part.left_speed_rad_s, part.right_speed_rad_s)
-        for t_s, left, right, left_speed, right_speed in zip(*(one.tolist() for one in columns), strict=True):
+        for t_s, left, right, left_speed, right_speed, _ in rows(drive.wheels):
             yield self._joints(t_s, WHEEL_TOPIC, [left, right], [left_speed, right_speed])
 
     def _poses(self, drive: DriveLog) -> Iterator[_Timed]:
-        part = drive.poses
-        columns = (part.t_s, part.x_m, part.y_m, part.yaw_rad)
-        for t_s, x_m, y_m, yaw_rad in zip(*(one.tolist() for one in columns), strict=True):
+        for t_s, x_m, y_m, yaw_rad, _ in rows(drive.poses):
             t_ns, header = self._header(t_s, MAP_FRAME)
             position = self._types["geometry_msgs/msg/Point"](x_m, y_m, 0.0)
             half = 0.5 * yaw_rad

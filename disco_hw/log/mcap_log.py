@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import IO, Any, Protocol, cast
+from typing import IO, Any, Protocol, TypeVar, cast
 
 import msgspec
 from foxglove_schemas_protobuf.Color_pb2 import Color
@@ -31,12 +30,13 @@ from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 
-from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene
+from disco_hw.log import Batch, BatchDecoder, End, Start, TaskScene, Time64
 from disco_hw.log.encoding import encode_json, json_schema
 from disco_hw.log.records import TOPICS, Estimate, Event, Fan, GuardVerdict, Plan, Record
 from drivers.types import PoseSample
@@ -61,44 +61,36 @@ _ROBOT = "robot"
 
 def views(record: Record, wall_ns: int) -> list[tuple[str, bytes]]:
     """Foxglove messages (topic, protobuf bytes) that show this record, true at `wall_ns`; none for most records."""
-    time = _timestamp(wall_ns)
+    return [(topic, message.SerializeToString()) for topic, message in _messages(record, _timestamp(wall_ns))]
+
+
+def _messages(record: Record, time: Timestamp) -> list[tuple[str, Message]]:
     match record:
         case Estimate():
-            pose = PoseInFrame(timestamp=time, frame_id=_WORLD, pose=_pose(record.x_m, record.y_m, record.yaw_rad))
+            pose = _pose(record.x_m, record.y_m, record.yaw_rad)
             transform = FrameTransform(
                 timestamp=time,
                 parent_frame_id=_WORLD,
                 child_frame_id=_ROBOT,
-                translation=Vector3(x=record.x_m, y=record.y_m, z=0.0),
-                rotation=_rotation(record.yaw_rad),
+                translation=pose.position,
+                rotation=pose.orientation,
             )
-            return [
-                ("/view/estimate", pose.SerializeToString()),
-                ("/view/transform", transform.SerializeToString()),
-            ]
+            placed = PoseInFrame(timestamp=time, frame_id=_WORLD, pose=pose)
+            return [("/view/estimate", placed), ("/view/transform", transform)]
         case PoseSample():
-            measured = PoseInFrame(timestamp=time, frame_id=_WORLD, pose=_pose(record.x_m, record.y_m, record.yaw_rad))
-            return [("/view/measured_pose", measured.SerializeToString())]
+            pose = _pose(record.x_m, record.y_m, record.yaw_rad)
+            return [("/view/measured_pose", PoseInFrame(timestamp=time, frame_id=_WORLD, pose=pose))]
         case Plan() if record.path_x_m:
             path = zip(record.path_x_m, record.path_y_m, record.path_yaw_rad, strict=False)
-            plan = PosesInFrame(
-                timestamp=time,
-                frame_id=_WORLD,
-                poses=[_pose(x, y, yaw) for x, y, yaw in path],
-            )
-            return [("/view/plan", plan.SerializeToString())]
+            poses = [_pose(x, y, yaw) for x, y, yaw in path]
+            return [("/view/plan", PosesInFrame(timestamp=time, frame_id=_WORLD, poses=poses))]
         case Fan() if record.weights:
-            return [("/view/rollouts", _rollouts(record, time).SerializeToString())]
+            return [("/view/rollouts", _rollouts(record, time))]
         case GuardVerdict() if record.path_x_m or record.obstacles:
-            return [("/view/fence", _stopping(record, time).SerializeToString())]
+            return [("/view/fence", _stopping(record, time))]
         case Event():
-            log = Log(
-                timestamp=time,
-                level=_LEVELS[record.level],
-                message=record.text,
-                name=record.code,
-            )
-            return [("/view/log", log.SerializeToString())]
+            level = _LEVELS[record.level]
+            return [("/view/log", Log(timestamp=time, level=level, message=record.text, name=record.code))]
     return []
 
 
@@ -139,12 +131,12 @@ def _stopping(record: GuardVerdict, time: Timestamp) -> SceneUpdate:
     return SceneUpdate(entities=[entity])
 
 
-def _line(points: Iterable[tuple[float, float]], colour: Color) -> LinePrimitive:
-    """Return a line of 2 cm through these points on the floor."""
+def _line(points: Iterable[tuple[float, float]], colour: Color, thickness_m: float = 0.02) -> LinePrimitive:
+    """Return a line through these points on the floor."""
     return LinePrimitive(
         type=LinePrimitive.LINE_STRIP,
         pose=_pose(0.0, 0.0, 0.0),
-        thickness=0.02,
+        thickness=thickness_m,
         color=colour,
         points=[Point3(x=x, y=y, z=0.0) for x, y in points],
     )
@@ -153,16 +145,10 @@ def _line(points: Iterable[tuple[float, float]], colour: Color) -> LinePrimitive
 def _rollouts(fan: Fan, time: Timestamp) -> SceneUpdate:
     """Return a line for each sequence, the fainter the less it weighs."""
     # A broken plan must still be seen in the log: neither as many points as weights promise, nor a weight, are certain.
-    points = [Point3(x=x, y=y, z=0.0) for x, y in zip(fan.x_m, fan.y_m, strict=False)]
+    points = list(zip(fan.x_m, fan.y_m, strict=False))
     count, heaviest = len(points) // len(fan.weights), fan.weights[0] or 1.0
     lines = [
-        LinePrimitive(
-            type=LinePrimitive.LINE_STRIP,
-            pose=_pose(0.0, 0.0, 0.0),
-            thickness=0.005,
-            color=Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / heaviest),
-            points=points[k * count : (k + 1) * count],
-        )
+        _line(points[k * count : (k + 1) * count], Color(r=0.3, g=0.5, b=0.9, a=0.15 + 0.85 * weight / heaviest), 0.005)
         for k, weight in enumerate(fan.weights)
     ]
     return SceneUpdate(entities=[SceneEntity(timestamp=time, id="rollouts", frame_id=_WORLD, lines=lines)])
@@ -174,15 +160,10 @@ def _timestamp(wall_ns: int) -> Timestamp:
 
 
 def _pose(x_m: float, y_m: float, yaw_rad: float) -> Pose:
-    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=_rotation(yaw_rad))
-
-
-def _rotation(yaw_rad: float) -> Quaternion:
     half = 0.5 * yaw_rad
     # sin and cos of an infinity raise; a broken estimate must still be seen in the log.
-    if not math.isfinite(half):
-        return Quaternion(x=0.0, y=0.0, z=math.nan, w=math.nan)
-    return Quaternion(x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
+    z, w = (math.sin(half), math.cos(half)) if math.isfinite(half) else (math.nan, math.nan)
+    return Pose(position=Vector3(x=x_m, y=y_m, z=0.0), orientation=Quaternion(x=0.0, y=0.0, z=z, w=w))
 
 
 PROFILE = ""
@@ -217,8 +198,7 @@ class ByteSink(Protocol):
         """Hand everything on to the operating system."""
 
 
-@dataclass(frozen=True, slots=True)
-class Metadata:
+class Metadata(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Metadata of a log: wall-clock time is monotonic time plus `wall_offset_ns`.
 
     `planner`: version of the planner (`control.plan.PLANNER_VERSION`); 0 where none is named, as in logs of version 1.
@@ -226,71 +206,28 @@ class Metadata:
     was not recorded.
     """
 
+    format: str = ""
     robot: str
     version: str
     part: int
-    start_ns: int
-    wall_offset_ns: int
-    format: str = FORMAT
+    start_ns: Time64
+    wall_offset_ns: Time64
     continues: str = ""
     continues_sequence: int | None = None
     planner: int = 0
 
-    def as_text(self) -> dict[str, str]:
-        """Return the metadata in the form kept in the file."""
-        text = {
-            "format": self.format,
-            "robot": self.robot,
-            "version": self.version,
-            "part": str(self.part),
-            "start_ns": str(self.start_ns),
-            "wall_offset_ns": str(self.wall_offset_ns),
-        }
-        if self.continues_sequence is not None:
-            text |= {"continues": self.continues, "continues_sequence": str(self.continues_sequence)}
-        if self.planner:
-            text["planner"] = str(self.planner)
-        return text
 
-    @staticmethod
-    def from_text(text: dict[str, str]) -> Metadata:
-        """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
-        start_ns, wall_offset_ns = int(text["start_ns"]), int(text["wall_offset_ns"])
-        if max(abs(start_ns), abs(wall_offset_ns)) > _MAX_TIME_NS // 2:
-            raise ValueError("times beyond what 64 bits of ns hold")
-        former = text.get("continues_sequence")
-        return Metadata(
-            text["robot"],
-            text["version"],
-            int(text["part"]),
-            start_ns,
-            wall_offset_ns,
-            text.get("format", ""),
-            text.get("continues", ""),
-            None if former is None else int(former),
-            int(text.get("planner", "0")),
-        )
+_T = TypeVar("_T")
 
 
-@dataclass(frozen=True, slots=True)
-class Ending:
-    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped."""
+def as_text(values: Metadata | End) -> dict[str, str]:
+    """Return metadata in the form kept in the file."""
+    return {name: str(value) for name, value in msgspec.to_builtins(values).items()}
 
-    t_ns: int
-    sequence: int
-    dropped_ticks: int
 
-    def as_text(self) -> dict[str, str]:
-        """Return the form kept in the file."""
-        return {"t_ns": str(self.t_ns), "sequence": str(self.sequence), "dropped_ticks": str(self.dropped_ticks)}
-
-    @staticmethod
-    def from_text(text: dict[str, str]) -> Ending:
-        """Read what `as_text` wrote; raises KeyError or ValueError on anything else."""
-        ending = Ending(int(text["t_ns"]), int(text["sequence"]), int(text["dropped_ticks"]))
-        if abs(ending.t_ns) > _MAX_TIME_NS // 2 or not 0 <= ending.sequence <= _MAX_TIME_NS:
-            raise ValueError("an end time or tick number beyond 64 bits")
-        return ending
+def from_text(text: dict[str, str], kind: type[_T]) -> _T:
+    """Read what `as_text` wrote; raises msgspec.ValidationError on anything else."""
+    return msgspec.convert(text, kind, strict=False)
 
 
 class McapLog:
@@ -298,6 +235,10 @@ class McapLog:
 
     A record that cannot be decoded is refused and counted, never raised: the rest of its tick is kept. A tick is never
     split between chunks, so whatever cuts the file short, a tick is in it whole or not at all.
+
+    `records` were written. `refused` are records and whole messages that were not what they should be, `last_refusal`
+    says in words which was the newest. `flushed_sequence`: the last tick that was handed to the sink, 0 if none was;
+    `flushed_refused`: refused records up to there.
     """
 
     def __init__(self, sink: ByteSink, start: Start) -> None:
@@ -306,54 +247,20 @@ class McapLog:
         self._decoder = BatchDecoder()
         self._offset_ns = start.wall_offset_ns
         self._pending_bytes = 0
-        self._sequence = self._flushed_sequence = 0
-        self._records = 0
-        self._refused = self._flushed_refused = 0
-        self._last_refusal = ""
+        self._sequence = self.flushed_sequence = 0
+        self.records = 0
+        self.refused = self.flushed_refused = 0
+        self.last_refusal = ""
         self._writer.start(profile=PROFILE, library=LIBRARY)
         wall_ns = start.start_ns + start.wall_offset_ns
-        metadata = Metadata(
-            start.robot,
-            start.version,
-            start.part,
-            start.start_ns,
-            start.wall_offset_ns,
-            continues=start.continues,
-            continues_sequence=start.continues_sequence if start.part > 1 else None,
-            planner=start.planner,
-        )
-        self._writer.add_metadata(METADATA, metadata.as_text())
+        metadata = msgspec.structs.replace(msgspec.convert(start, Metadata, from_attributes=True), format=FORMAT)
+        self._writer.add_metadata(METADATA, as_text(metadata))
         for attachment in start.attachments:
             self._writer.add_attachment(wall_ns, wall_ns, attachment.name, attachment.media_type, attachment.data)
         self._channels = tuple(self._json_channel(topic.name, topic.record) for topic in TOPICS)
         self._view_channels = self._register_views(() if start.scene is None else ((SCENE, SceneUpdate),))
         self._scene = None if start.scene is None else scene_message(start.scene)
         self._writer.flush()  # type: ignore[no-untyped-call]
-
-    @property
-    def flushed_sequence(self) -> int:
-        """Number of the last tick that was handed to the sink; 0 if none was."""
-        return self._flushed_sequence
-
-    @property
-    def flushed_refused(self) -> int:
-        """Refused records of the ticks up to there."""
-        return self._flushed_refused
-
-    @property
-    def records(self) -> int:
-        """Number of records written."""
-        return self._records
-
-    @property
-    def refused(self) -> int:
-        """Records and whole messages that were not what they should be, and are not in the file."""
-        return self._refused
-
-    @property
-    def last_refusal(self) -> str:
-        """The newest refusal in words, or empty."""
-        return self._last_refusal
 
     def write(self, message: bytes) -> None:
         """Write the records of one message of the recorder."""
@@ -381,14 +288,13 @@ class McapLog:
         """End the chunk and hand it on, so that a reader can have everything written so far."""
         self._writer.flush()  # type: ignore[no-untyped-call]
         self._pending_bytes = 0
-        self._flushed_sequence = self._sequence
-        self._flushed_refused = self._refused
+        self.flushed_sequence = self._sequence
+        self.flushed_refused = self.refused
 
     def end(self, end: End) -> None:
         """Write the recorder's last word; no tick comes after it."""
         self.flush()
-        ending = Ending(end.t_ns, end.sequence, end.dropped_ticks)
-        self._writer.add_metadata(ENDING, ending.as_text())
+        self._writer.add_metadata(ENDING, as_text(end))
 
     def finish(self) -> None:
         """Finish the file with its index; nothing can be written after it."""
@@ -407,11 +313,11 @@ class McapLog:
         for channel, payload in payloads:
             self._writer.add_message(channel, log_time, payload, publish_time, batch.sequence & 0xFFFFFFFF)
             self._pending_bytes += len(payload) + _MESSAGE_OVERHEAD
-        self._records += 1
+        self.records += 1
 
     def _refuse(self, why: str) -> None:
-        self._refused += 1
-        self._last_refusal = why
+        self.refused += 1
+        self.last_refusal = why
 
     def _json_channel(self, topic: str, record: type) -> int:
         schema = self._writer.register_schema(

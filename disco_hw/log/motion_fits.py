@@ -293,7 +293,13 @@ def _of_begin(windows: MotionWindows) -> MotionWindows:
     moving = np.flatnonzero(np.nan_to_num(np.abs(windows.rolled_rad)).max(axis=1, initial=0.0) > MOVING_RAD)
     first = int(moving[0]) if moving.size else 0
     part = slice(max(first - 40, 0), first + _CLOCK_WINDOWS)
-    return MotionWindows(*(getattr(windows, name)[part] for name in MotionWindows.__slots__))
+    return _beside(windows, part, part)
+
+
+def _beside(windows: MotionWindows, wheels: slice | Mask, poses: slice | Mask) -> MotionWindows:
+    """Return the wheels of some windows beside the poses of as many others."""
+    rolling = (windows.t_s[wheels], windows.commanded_rad[wheels], windows.rolled_rad[wheels])
+    return MotionWindows(*rolling, windows.moved_m[poses], windows.heading_rad[poses], windows.turned_rad[poses])
 
 
 def _shifted(windows: MotionWindows, steps: int) -> MotionWindows | None:
@@ -303,11 +309,4 @@ def _shifted(windows: MotionWindows, steps: int) -> MotionWindows | None:
         return None
     wheels, poses = (slice(0, count), slice(steps, None)) if steps >= 0 else (slice(-steps, None), slice(0, count))
     together = np.abs(windows.t_s[poses] - windows.t_s[wheels] - steps * STEP_S) < _SAME_TIME_S
-    return MotionWindows(
-        windows.t_s[wheels][together],
-        windows.commanded_rad[wheels][together],
-        windows.rolled_rad[wheels][together],
-        windows.moved_m[poses][together],
-        windows.heading_rad[poses][together],
-        windows.turned_rad[poses][together],
-    )
+    return _beside(_beside(windows, wheels, poses), together, together)

@@ -23,7 +23,6 @@ from disco_hw.log import (
     TICK,
     Attachment,
     End,
-    Launch,
     Start,
     TaskScene,
     WriterStatus,
@@ -107,7 +106,6 @@ class ProcessRecorder:
         self._slow_disk_reported = False
         self._end: bytes | None = None
         self._final: RecorderStats | None = None
-        _check_place(recording.path)
         start = Start(
             path=str(recording.path.absolute()),
             robot=recording.robot,
@@ -166,7 +164,6 @@ class ProcessRecorder:
         if self._final is not None:
             return self._final
         self._exchange(_SENT_PER_TICK)
-        self._keeper.read()
         self._look_after(time.monotonic())
         return self._stats()
 
@@ -195,9 +192,8 @@ class ProcessRecorder:
             self._end = msgspec.msgpack.encode(End(time.monotonic_ns(), self._sequence, self._delivery.dropped_ticks))
             # There may be room again.
             self._retry_s = 0.0
-            while self._unfinished() and time.monotonic() < deadline_s:
+            while (self._line is not None or self._delivery.waiting_ticks) and time.monotonic() < deadline_s:
                 self._exchange(self._recording.queue_ticks)
-                self._keeper.read()
                 self._look_after(time.monotonic())
                 self._wait(min(_CLOSING_STEP_S, max(0.0, deadline_s - time.monotonic())))
             self._report_losses()
@@ -216,12 +212,13 @@ class ProcessRecorder:
         self._launch()
         while self._line is not None and not self._line.recording:
             self._exchange(0)
-            self._keeper.read()
             if self._line.ended or time.monotonic() > deadline_s or not self._keeper.alive:
-                error = self._line.status.error or f"{self._recording.path}: the log writer did not start"
+                error = self._line.status.error or (
+                    f"{self._recording.path}: the log writer did not start; see the message above"
+                )
                 self._line.close()
                 self._keeper.close()
-                raise LogError(f"{error}; see the message above, or give another path with --log")
+                raise LogError(f"{error}; give another path with --log")
             self._wait(_CLOSING_STEP_S)
 
     def _encodable(self, now_ns: int, records: Sequence[Record]) -> list[Record]:
@@ -238,26 +235,24 @@ class ProcessRecorder:
         return kept
 
     def _exchange(self, most: int) -> None:
-        """Send what has not been sent, `most` ticks of it, and take in what is confirmed."""
+        """Send what has not been sent, `most` ticks of it, and take in what writer and keeper say."""
         self._send(most)
         self._read()
+        self._keeper.read()
 
     def _send(self, most: int) -> None:
         line, delivery = self._line, self._delivery
-        if line is None:
+        if line is None or not line.send_rest():
             return
-        if line.send_rest():
-            for _ in range(most):
-                following = delivery.next_frame()
-                if following is None:
-                    break
-                delivery.sent()
-                if not line.send(following):
-                    break
-            else:
-                following = b""
-            if following is None and self._end is not None:
-                line.send_end(self._end)
+        for _ in range(most):
+            following = delivery.next_frame()
+            if following is None:
+                break
+            delivery.sent()
+            if not line.send(following):
+                return
+        if self._end is not None and delivery.next_frame() is None:
+            line.send_end(self._end)
 
     def _read(self) -> None:
         line, delivery = self._line, self._delivery
@@ -333,8 +328,16 @@ class ProcessRecorder:
         self._look_after(now_s)
 
     def _launch(self) -> None:
-        launch = Launch(self._next_part, time.monotonic_ns(), self._continues, self._delivery.last_delivered)
-        connection = self._keeper.launch(launch)
+        request = msgspec.structs.replace(
+            self._start,
+            attachments=(),
+            scene=None,
+            part=self._next_part,
+            start_ns=time.monotonic_ns(),
+            continues=self._continues,
+            continues_sequence=None if self._next_part == 1 else self._delivery.last_delivered,
+        )
+        connection = self._keeper.launch(request)
         if connection is not None:
             self._line = WriterLine(connection, self._start.path, self._next_part)
             self._next_part = max(2, self._next_part)
@@ -377,10 +380,6 @@ class ProcessRecorder:
             self._messages.append(sentence)
         self._last_error = sentence
 
-    def _unfinished(self) -> bool:
-        """Whether there is something to wait for at the end."""
-        return self._line is not None or bool(self._delivery.waiting_ticks)
-
     def _wait(self, timeout_s: float) -> None:
         """Wait for the writer, or until it can take more."""
         if self._line is None or self._line.ended:
@@ -419,17 +418,3 @@ def _cause(line: WriterLine, code: int | None) -> str:
         return "the log writer was ended by another program"
     how = "" if code is None else f" (signal {-code})" if code < 0 else f" (exit status {code})"
     return f"the log writer died{how}; {status.path} holds what it had written"
-
-
-def _check_place(path: Path) -> None:
-    """Create the log's directory. Raises LogError if the writer could not create a file there."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogError(
-            f"{path.parent}: cannot be created ({error.strerror}); give a directory that can be written to"
-        ) from None
-    if path.exists():
-        raise LogError(f"{path}: already exists and a log is never overwritten; give another name")
-    if not os.access(path.parent, os.W_OK | os.X_OK):
-        raise LogError(f"{path.parent}: cannot be written to; give another directory or correct its permissions")

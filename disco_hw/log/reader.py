@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
 from disco_hw.files import LOG, open_file
+from disco_hw.log import End
 from disco_hw.log.container import (
     ChunkRef,
     Contents,
@@ -27,7 +28,7 @@ from disco_hw.log.container import (
     read_contents,
 )
 from disco_hw.log.encoding import JsonDecoder
-from disco_hw.log.mcap_log import ENDING, FORMAT, METADATA, RECOVERY, Ending, Metadata
+from disco_hw.log.mcap_log import ENDING, FORMAT, METADATA, RECOVERY, Metadata, from_text
 from disco_hw.log.records import TOPIC_BY_NAME, PlanFigures, Record
 
 Column = NDArray[np.generic]
@@ -80,6 +81,7 @@ def _objects(values: list[Any]) -> Column:
 
 
 _R = TypeVar("_R")
+_T = TypeVar("_T")
 # Times are int64 in our records.
 _EARLIEST_NS, _LATEST_NS = -(2**63), 2**63 - 1
 _NO_TIME = "a time or count in it is beyond 64 bits; leave this log out"
@@ -141,18 +143,22 @@ class Log:
 
     Reading raises LogError on a damaged chunk of a log that is complete otherwise; of a log without its index the
     damaged chunks have been left out already, and `damage` says so.
+
+    `complete`: the file has its index, as a writer leaves it that came to its end. `ending`: the recorder's last word;
+    None if there is none, as the daemon or its recorder was gone before.
     """
 
     def __init__(self, path: Path) -> None:
         self._fd = open_file(path, LOG)
-        self._path = path
+        self.path = path
         try:
             self._contents = _contents(self._fd, path)
-            self._metadata = _metadata(self._contents, path)
-            self._ending = _ending(self._contents)
+            self.metadata = _metadata(self._contents, path)
+            self.ending = _named(self._contents, ENDING, End)
         except BaseException:
             self.close()
             raise
+        self.complete = self._contents.complete
         self._decoder = JsonDecoder()
         self._last_tick = 0
         self._topics = {
@@ -176,30 +182,10 @@ class Log:
             self._fd = -1
 
     @property
-    def path(self) -> Path:
-        """Path of the log file."""
-        return self._path
-
-    @property
-    def complete(self) -> bool:
-        """Whether the file has its index, as a writer leaves it that came to its end."""
-        return self._contents.complete
-
-    @property
-    def ending(self) -> Ending | None:
-        """The recorder's last word; None if there is none, as the daemon or its recorder was gone before."""
-        return self._ending
-
-    @property
     def damage(self) -> tuple[str, ...]:
         """Description of lost data; in a recovered log, of what the recovery could not copy."""
         recovered = [record.metadata.get("lost", "") for record in self._contents.metadata if record.name == RECOVERY]
         return (*self._contents.damage, *(line for text in recovered for line in text.splitlines()))
-
-    @property
-    def metadata(self) -> Metadata:
-        """Metadata of the log."""
-        return self._metadata
 
     @property
     def counts(self) -> dict[str, int]:
@@ -230,19 +216,19 @@ class Log:
         end_ns: int | None,
     ) -> Iterator[tuple[int, int, str, _R]]:
         """Time of the tick, its number, topic and decoded record."""
-        offset = self._metadata.wall_offset_ns
+        offset = self.metadata.wall_offset_ns
         names = self._topics
         for message in self._messages(topics, start_ns, end_ns):
             topic = names[message.channel_id]
             try:
                 record = decode(topic, message.data)
             except OverflowError:
-                raise LogError(f"{self._path}: {_NO_TIME}") from None
+                raise LogError(f"{self.path}: {_NO_TIME}") from None
             except (msgspec.MsgspecError, RecursionError) as error:
                 # Its checksum is right, so it was written like this: there is nothing to recover.
-                by = self._metadata.version or "another one"
+                by = self.metadata.version or "another one"
                 raise LogError(
-                    f"{self._path}: a record of {topic} cannot be read ({error}); read it with the disco-hw that "
+                    f"{self.path}: a record of {topic} cannot be read ({error}); read it with the disco-hw that "
                     f"recorded it: {by}"
                 ) from None
             yield message.log_time - offset, message.sequence, topic, record
@@ -250,11 +236,7 @@ class Log:
     def columns(
         self, topic: str, start_ns: int | None = None, end_ns: int | None = None
     ) -> dict[str, NDArray[np.generic]]:
-        """Return all records of a topic as one array a field, shape (N, ...), and the tick's time as `now_ns`.
-
-        Tuples of one length become (N, k) arrays, of different lengths arrays of objects; a mapping gives one array
-        `field.key` for each key.
-        """
+        """Return all records of a topic as one array a field, shape (N, ...), as `to_columns` makes them."""
         now_ns: list[int] = []
         records: list[Record] = []
         for entry in self.records((topic,), start_ns, end_ns):
@@ -273,8 +255,8 @@ class Log:
                 try:
                     return read_attachment(self._fd, ref)
                 except DamagedError as damage:
-                    raise LogError(f"{self._path}: {damage}; {_RECOVER}") from None
-        raise LogError(f"{self._path}: holds no {name}; it holds {', '.join(self.attachment_names()) or 'no files'}")
+                    raise LogError(f"{self.path}: {damage}; {_RECOVER}") from None
+        raise LogError(f"{self.path}: holds no {name}; it holds {', '.join(self.attachment_names()) or 'no files'}")
 
     def summary(self) -> LogSummary:
         """Summarise the log's contents; reads the whole file once. Raises LogError for damage."""
@@ -286,21 +268,21 @@ class Log:
             missing += lost
         duration_s = (last - first) * 1e-9
         # A part that continues another holds ticks from before it was begun.
-        start_ns = min(self._metadata.start_ns, first) if ticks else self._metadata.start_ns
-        ending = self._ending
+        start_ns = min(self.metadata.start_ns, first) if ticks else self.metadata.start_ns
+        ending = self.ending
         if ending is not None:
-            missing += max(0, ending.sequence - (self._last_tick or self._metadata.continues_sequence or 0))
+            missing += max(0, ending.sequence - (self._last_tick or self.metadata.continues_sequence or 0))
         return LogSummary(
-            path=str(self._path),
+            path=str(self.path),
             bytes=self._contents.size,
             complete=self.complete,
-            ended=True if ending is not None else False if self._metadata.format >= FORMAT else None,
-            end=_iso((last if ending is None else ending.t_ns) + self._metadata.wall_offset_ns),
-            continues=self._metadata.continues,
-            robot=self._metadata.robot,
-            version=self._metadata.version,
-            part=self._metadata.part,
-            start=_iso(start_ns + self._metadata.wall_offset_ns),
+            ended=True if ending is not None else False if self.metadata.format >= FORMAT else None,
+            end=_iso((last if ending is None else ending.t_ns) + self.metadata.wall_offset_ns),
+            continues=self.metadata.continues,
+            robot=self.metadata.robot,
+            version=self.metadata.version,
+            part=self.metadata.part,
+            start=_iso(start_ns + self.metadata.wall_offset_ns),
             duration_s=duration_s,
             ticks=ticks,
             missing_ticks=missing,
@@ -308,7 +290,7 @@ class Log:
                 topic: TopicSummary(count, count / duration_s if duration_s > 0.0 else 0.0)
                 for topic, count in self.counts.items()
             },
-            attachments={ref.name: ref.size for ref in self._contents.attachments},
+            attachments={ref.name: ref.data_size for ref in self._contents.attachments},
             damage=self.damage,
         )
 
@@ -319,13 +301,13 @@ class Log:
     def _ticks(self) -> Iterator[tuple[int, int]]:
         """Time of each tick and the number of ticks missing just before it."""
         # Ticks are numbered from 1 on, in all parts of a log together.
-        previous = 0 if self._metadata.part == 1 else self._metadata.continues_sequence
+        previous = 0 if self.metadata.part == 1 else self.metadata.continues_sequence
         any_yet = False
         for message in self._messages(None, None, None):
             if any_yet and message.sequence == previous:
                 continue
             lost = 0 if previous is None else (message.sequence - previous - 1) & 0xFFFFFFFF
-            yield message.log_time - self._metadata.wall_offset_ns, lost
+            yield message.log_time - self.metadata.wall_offset_ns, lost
             previous = self._last_tick = message.sequence
             any_yet = True
 
@@ -334,7 +316,7 @@ class Log:
         if unknown:
             raise LogError(f"{unknown[0]}: no such topic; there are {', '.join(TOPIC_BY_NAME)}")
         channels = {channel for channel, topic in self._topics.items() if topics is None or topic in topics}
-        offset = self._metadata.wall_offset_ns
+        offset = self.metadata.wall_offset_ns
         start = None if start_ns is None else start_ns + offset
         end = None if end_ns is None else end_ns + offset
         for chunk in self._contents.chunks:
@@ -342,7 +324,7 @@ class Log:
                 continue
             for message in self._chunk_messages(chunk, channels):
                 if not _EARLIEST_NS <= message.log_time - offset <= _LATEST_NS:
-                    raise LogError(f"{self._path}: {_NO_TIME}")
+                    raise LogError(f"{self.path}: {_NO_TIME}")
                 if (start is None or message.log_time >= start) and (end is None or message.log_time < end):
                     yield message
 
@@ -350,7 +332,7 @@ class Log:
         try:
             yield from messages(read_chunk(self._fd, chunk), channels)
         except DamagedError as damage:
-            raise LogError(f"{self._path}: at byte {chunk.offset}: {damage}; {_RECOVER}") from None
+            raise LogError(f"{self.path}: at byte {chunk.offset}: {damage}; {_RECOVER}") from None
 
 
 def open_log(path: Path) -> Log:
@@ -368,12 +350,9 @@ def _contents(fd: int, path: Path) -> Contents:
 
 
 def _metadata(contents: Contents, path: Path) -> Metadata:
-    for record in contents.metadata:
-        if record.name == METADATA:
-            try:
-                return Metadata.from_text(record.metadata)
-            except (KeyError, ValueError):
-                break
+    metadata = _named(contents, METADATA, Metadata)
+    if metadata is not None:
+        return metadata
     if contents.chunks:
         raise LogError(
             f"{path}: an MCAP file, but not a log of disco-hw; write it as a CSV, which `disco-hw import` takes"
@@ -381,14 +360,15 @@ def _metadata(contents: Contents, path: Path) -> Metadata:
     raise LogError(f"{path}: nothing of the log is left but its first bytes; there is nothing to read")
 
 
-def _ending(contents: Contents) -> Ending | None:
-    for record in contents.metadata:
-        if record.name == ENDING:
-            try:
-                return Ending.from_text(record.metadata)
-            except (KeyError, ValueError):
-                break
-    return None
+def _named(contents: Contents, name: str, kind: type[_T]) -> _T | None:
+    """Return the first metadata of this name; None if there is none or it is damaged."""
+    text = next((record.metadata for record in contents.metadata if record.name == name), None)
+    if text is None:
+        return None
+    try:
+        return from_text(text, kind)
+    except msgspec.ValidationError:
+        return None
 
 
 def _iso(wall_ns: int) -> str:

@@ -23,7 +23,7 @@ from typing import Literal
 
 import msgspec
 
-from disco_hw.log import END, MESSAGE_BYTES, End, Ended, Frames, Launch, Start, Started, WriterStatus
+from disco_hw.log import END, MESSAGE_BYTES, End, Ended, Frames, Start, Started, WriterStatus
 from disco_hw.log.mcap_log import McapLog
 
 # EX_CANTCREAT and EX_IOERR of sysexits.h.
@@ -303,38 +303,31 @@ def keep(channel: socket.socket, start: Start) -> None:
         if not message:
             return
         connection = socket.socket(fileno=descriptors[0])
-        launch = msgspec.msgpack.decode(message, type=Launch)
+        request = msgspec.msgpack.decode(message, type=Start)
         try:
             pid = os.fork()
         except OSError as error:
+            fault = f"{request.path}: no process can be made to write it ({_reason(error)})"
+            StatusLine(connection).send(WriterStatus("failed", request.path, request.part, error=fault))
             connection.close()
-            _send_message(channel, Started(0, f"no process can be made ({error.strerror})"))
+            _send_message(channel, Started(0))
             continue
         if pid == 0:
             # A writer that kept these would hide the end of the keeper and of other writers.
             for descriptor in living:
                 os.close(descriptor)
             channel.close()
-            _write(start, launch, connection)
+            _write(msgspec.structs.replace(request, attachments=start.attachments, scene=start.scene), connection)
         connection.close()
         living[os.pidfd_open(pid)] = pid
         _send_message(channel, Started(pid))
 
 
-def _write(start: Start, launch: Launch, connection: socket.socket) -> None:
+def _write(start: Start, connection: socket.socket) -> None:
     """Be a writer, and end as one."""
     code = 1
     try:
-        code = run(
-            msgspec.structs.replace(
-                start,
-                part=launch.part,
-                start_ns=launch.start_ns,
-                continues=launch.continues,
-                continues_sequence=launch.continues_sequence,
-            ),
-            connection,
-        )
+        code = run(start, connection)
     except Exception:
         sys.excepthook(*sys.exc_info())
     finally:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import msgspec
 
 from disco_hw.errors import LogError
-from disco_hw.log import END, MESSAGE_BYTES, Ended, Launch, Start, Started, WriterStatus, frame
+from disco_hw.log import END, MESSAGE_BYTES, Ended, Start, Started, WriterStatus, frame
 from disco_hw.processes import spawn_at_normal_priority
 
 
@@ -68,10 +68,8 @@ class WriterLine:
         while self._rest and not self.ended:
             try:
                 sent = self._connection.send(self._rest)
-            except BlockingIOError:
-                return False
             except OSError:
-                # What it said last may still be waiting to be read; that it has gone is found there.
+                # Full, or gone: what it said last may still be waiting to be read, and that it has gone is found there.
                 return False
             self._rest = self._rest[sent:]
         return not self._rest
@@ -146,7 +144,7 @@ class KeeperLink:
         """Whether the keeper process is dead, or has not started a requested writer in time."""
         return not self.alive or (self._requested_s is not None and now_s - self._requested_s > _REPLY_TIMEOUT_S)
 
-    def launch(self, launch: Launch) -> socket.socket | None:
+    def launch(self, request: Start) -> socket.socket | None:
         """Ask for a writer; returns the recorder's end of the socket to it, or None without a keeper."""
         if self._channel is None:
             return None
@@ -155,7 +153,7 @@ class KeeperLink:
             ours.setblocking(False)
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
             try:
-                socket.send_fds(self._channel, [msgspec.msgpack.encode(launch)], [theirs.fileno()])
+                socket.send_fds(self._channel, [msgspec.msgpack.encode(request)], [theirs.fileno()])
             except OSError:
                 ours.close()
                 self._hang_up()
@@ -195,8 +193,6 @@ class KeeperLink:
                 self._process.wait(1.0)
             except subprocess.TimeoutExpired:
                 self._end_process()
-            if self._process is not None and self._process.stdout is not None:
-                self._process.stdout.close()
             self._process = None
 
     def _open_writer(self) -> None:
@@ -229,8 +225,6 @@ class KeeperLink:
         if self._process is not None:
             self._process.kill()
             self._process.wait()
-            if self._process.stdout is not None:
-                self._process.stdout.close()
             self._process = None
 
 

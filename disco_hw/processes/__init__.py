@@ -15,7 +15,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,12 +55,11 @@ class Step:
         return f"{self.name}: {self.text}"
 
 
-def limit_thread_pools() -> Step:
+def limit_thread_pools() -> None:
     """Hold the numeric libraries to one thread each; must come before they are imported to bind all of them.
 
     Torch and numba are also held if they are imported already; a BLAS that is loaded keeps the threads it has.
     """
-    numpy_is_loaded = "numpy" in sys.modules and os.environ.get("OPENBLAS_NUM_THREADS") != "1"
     for name in _COUNTED_BY:
         # Numba reads its variable again at each compilation and raises if it then differs from the threads it has.
         if not (name.startswith("NUMBA") and "numba" in sys.modules):
@@ -67,45 +67,31 @@ def limit_thread_pools() -> Step:
     for name in ("torch", "numba"):
         if (module := sys.modules.get(name)) is not None:
             module.set_num_threads(1)
-    if numpy_is_loaded:
-        return Step("threads", False, "numpy was loaded before; start with OPENBLAS_NUM_THREADS=1 in the environment")
-    return Step("threads", True, "numeric libraries use one thread")
 
 
 def spawn_at_normal_priority(command: list[str], pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
-    """Start a process that never runs in the real-time class, whatever the caller's is; its output can be read.
+    """Start a process that never runs in the real-time class, whatever the caller's is; it has no input and output.
 
     A child inherits the scheduling of the thread that makes it, and a child at the loop's priority would take its core
     from the loop while it starts; so a thread made for it gives the priority up first. Its own session keeps the
-    terminal's Ctrl-C from it; it keeps the descriptors `pass_fds`. Standard output is a pipe that does not block its
-    reader. Raises LogError.
+    terminal's Ctrl-C from it; it keeps the descriptors `pass_fds`. Raises LogError.
     """
-    made: list[subprocess.Popen[bytes]] = []
-    failed: list[OSError] = []
 
-    def spawn() -> None:
+    def spawn() -> subprocess.Popen[bytes]:
         with suppress(OSError):
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
             if os.getpriority(os.PRIO_PROCESS, 0) < 0:
                 os.setpriority(os.PRIO_PROCESS, 0, 0)
-        try:
-            made.append(
-                subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, start_new_session=True, pass_fds=pass_fds
-                )
-            )
-        except OSError as error:
-            failed.append(error)
+        none = subprocess.DEVNULL
+        return subprocess.Popen(command, stdin=none, stdout=none, start_new_session=True, pass_fds=pass_fds)
 
-    thread = threading.Thread(target=spawn, name="log-writer-start")
-    thread.start()
-    thread.join()
-    if failed:
-        raise LogError(f"{command[0]}: cannot start the log writer ({failed[0].strerror}); repair the installation")
-    process = made[0]
-    assert process.stdout is not None
-    os.set_blocking(process.stdout.fileno(), False)
-    return process
+    try:
+        with ThreadPoolExecutor(1, thread_name_prefix="log-writer-start") as thread:
+            return thread.submit(spawn).result()
+    except OSError as error:
+        raise LogError(
+            f"{command[0]}: cannot start the log writer ({error.strerror}); repair the installation"
+        ) from None
 
 
 # Chosen: short beside a tick of 20 ms, in which the loop may wait for another thread.
@@ -151,18 +137,22 @@ def spare_memory() -> None:
     _LIBC.pthread_attr_destroy(attributes)
 
 
-def enter_real_time(priority: int, cpus: Collection[int] = ()) -> tuple[Step, ...]:
+def enter_real_time(priority: int) -> tuple[Step, ...]:
     """Take every measure, in the order that lets threads made later inherit them; never raises for a refused one.
 
     To be called when everything is imported, warmed up and allocated, before the link's threads are made, and after
     other processes were started: children inherit the scheduler too. The calling thread gets SCHED_FIFO 10 below
     `priority` (at least 1), for the threads to inherit; `raise_loop_thread` gives the loop its own. `priority` 0
-    leaves the scheduler and the memory alone. `cpus`: the only CPUs to run on, all if empty.
+    leaves the scheduler and the memory alone.
     """
-    steps = [_set_switch_interval(), _freeze_garbage()]
-    if cpus:
-        done, hint = f"runs on {sorted(cpus)}", "name CPUs that this computer has"
-        steps.append(_try("cpus", lambda: os.sched_setaffinity(0, cpus), done, hint))
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    steps = [
+        Step("interpreter", True, f"a thread gives way within {SWITCH_INTERVAL_S * 1e3:g} ms"),
+        Step("garbage collector", True, f"off, {gc.get_freeze_count()} objects frozen"),
+    ]
     if priority == 0:
         return (*steps, Step("scheduler", False, "unchanged, because daemon.realtime_priority is 0"))
     steps.append(_lock_memory())
@@ -194,18 +184,6 @@ def can_lock_memory() -> bool:
     """Whether all memory, present and future, may be locked, without locking it."""
     unlimited = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY
     return _has_capability(_CAP_IPC_LOCK) or unlimited
-
-
-def _set_switch_interval() -> Step:
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
-    return Step("interpreter", True, f"a thread gives way within {SWITCH_INTERVAL_S * 1e3:g} ms")
-
-
-def _freeze_garbage() -> Step:
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    return Step("garbage collector", True, f"off, {gc.get_freeze_count()} objects frozen")
 
 
 def _lock_memory() -> Step:

@@ -89,8 +89,6 @@ def drive(recorder, first, count, period_s=0.0):
 class ForkedKeeper:
     """A keeper that is forked from this process, as to start Python and import its code costs more than most tests."""
 
-    stdout = None
-
     def __init__(self, command, pass_fds=()):
         self.pid = os.fork()
         if self.pid == 0:

@@ -5,7 +5,7 @@ import pytest
 
 from disco_hw.errors import LogError
 from disco_hw.log import Attachment
-from disco_hw.log.load import drive_from_log, ticks_per_rev
+from disco_hw.log.load import drive_from_log, nominal_robot
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Event
 from drivers.types import PoseSample, WheelSample
@@ -112,9 +112,9 @@ def test_a_log_in_which_nothing_was_driven_is_refused(tmp_path):
 def test_the_ticks_of_a_revolution_come_from_the_configuration_in_the_log(tmp_path, content, expected):
     kept = (Attachment("robot.toml", "application/toml", content),)
     with open_log(write_log(tmp_path / "run.mcap", drive_ticks(1), attachments=kept)) as log:
-        assert ticks_per_rev(log) == expected
+        assert nominal_robot(log).get("ticks_per_rev") == expected
 
 
 def test_without_a_configuration_the_ticks_are_unknown(tmp_path):
     with open_log(write_log(tmp_path / "run.mcap", drive_ticks(1), attachments=())) as log:
-        assert ticks_per_rev(log) is None
+        assert nominal_robot(log).get("ticks_per_rev") is None

@@ -11,7 +11,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from disco_hw.log import TaskScene, batch_encoder
 from disco_hw.log.log_command import recover_log
-from disco_hw.log.mcap_log import CHUNK_BYTES, METADATA, SCENE, McapLog, Metadata
+from disco_hw.log.mcap_log import CHUNK_BYTES, FORMAT, METADATA, SCENE, McapLog, Metadata, from_text
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import TOPIC_INDEX, TOPICS, Event, FrameIn
 from tools.log_samples import ATTACHMENTS, PERIOD_NS, WALL_OFFSET_NS, drive_ticks, log_bytes, start, tick
@@ -93,7 +93,9 @@ def test_metadata_and_attachments_are_there(driven):
     reader = foreign(driven)
     (metadata,) = reader.iter_metadata()
     assert metadata.name == METADATA
-    assert Metadata.from_text(metadata.metadata) == Metadata("wombot", "1.2.3", 1, 5, WALL_OFFSET_NS)
+    assert from_text(metadata.metadata, Metadata) == Metadata(
+        format=FORMAT, robot="wombot", version="1.2.3", part=1, start_ns=5, wall_offset_ns=WALL_OFFSET_NS
+    )
     assert [(kept.name, kept.data) for kept in reader.iter_attachments()] == [(a.name, a.data) for a in ATTACHMENTS]
 
 

@@ -322,7 +322,7 @@ def test_open_files_do_not_add_up(tmp_path):
 def test_a_log_is_never_overwritten(path):
     path.parent.mkdir()
     path.write_text("precious", encoding="utf-8")
-    with pytest.raises(LogError, match="already exists"):
+    with pytest.raises(LogError, match=r"run.mcap: cannot be created \(File exists\); give another path with --log"):
         ProcessRecorder(recording(path))
     assert path.read_text(encoding="utf-8") == "precious"
 

@@ -1,5 +1,6 @@
 """The writer as a process, with real signals and a disk that is really full."""
 
+import errno
 import os
 import resource
 import signal
@@ -28,6 +29,7 @@ from tests.log.processes import (
     size,
     wait_until,
 )
+from tools.log_samples import start
 
 
 @pytest.fixture
@@ -253,6 +255,25 @@ def test_a_status_nobody_reads_costs_nothing_and_the_next_that_is_read_is_whole(
     ours.close()
     line.send(status)
     theirs.close()
+
+
+def test_where_no_process_can_be_made_the_reason_is_told_in_the_writers_place(path, monkeypatch):
+    def fork():
+        raise BlockingIOError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(writer.os, "fork", fork)
+    recorder, keeper = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours, theirs = socket.socketpair()
+    request = start(path, part=2)
+    with recorder, keeper, ours:
+        with theirs:
+            socket.send_fds(recorder, [msgspec.msgpack.encode(request)], [theirs.fileno()])
+        recorder.shutdown(socket.SHUT_WR)
+        writer.keep(keeper, request)
+        status = msgspec.json.decode(ours.recv(1 << 16), type=writer.WriterStatus)
+        assert (status.state, status.part) == ("failed", 2)
+        assert status.error.endswith("no process can be made to write it (Resource temporarily unavailable)")
+        assert ours.recv(1) == b""
 
 
 def test_a_half_written_end_is_cut_off(path):

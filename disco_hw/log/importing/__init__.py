@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cache
 from itertools import groupby
@@ -24,7 +24,7 @@ from disco_hw.files import LOG, begin_of
 from disco_hw.files import ROBOT_TOML as ROBOT_FILE
 from disco_hw.log import ROBOT_TOML, Attachment, End, Start, attachment, batch_encoder, version
 from disco_hw.log.container import MAGIC
-from disco_hw.log.drive import LONGEST_COMMAND_S, DriveLog
+from disco_hw.log.drive import LONGEST_COMMAND_S, DriveLog, rows
 from disco_hw.log.importing.losses import WARNING, warnings_first, without_standing_headings
 from disco_hw.log.importing.rosbag_file import METADATA, SUFFIXES, is_bag
 from disco_hw.log.mcap_log import McapLog
@@ -112,42 +112,21 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
     return log.records
 
 
-def _samples(drive: DriveLog) -> Iterator[_Timed]:
+def _samples(drive: DriveLog) -> list[_Timed]:
     """Return records with their time (ns) and segment, in order of time."""
-    return iter(sorted([*_commands(drive), *_wheels(drive), *_poses(drive)], key=lambda sample: sample[0]))
-
-
-def _commands(drive: DriveLog) -> Iterator[_Timed]:
-    part = drive.commands
-    rows = zip(
-        *(column.tolist() for column in (part.t_s, part.segment, part.left_rad_s, part.right_rad_s)), strict=True
-    )
-    for t_s, segment, left, right in rows:
-        t_ns = _ns(t_s)
-        known = not math.isnan(left)
-        now_left, now_right = (left, right) if known else (0.0, 0.0)
-        yield (
-            t_ns,
-            segment,
-            Command(t_ns, now_left, now_right, now_left, now_right, LONGEST_COMMAND_S, in_force=known, source=SOURCE),
+    found: list[_Timed] = []
+    for t_s, left, right, segment in rows(drive.commands):
+        t_ns, known = _ns(t_s), not math.isnan(left)
+        given = (left, right) if known else (0.0, 0.0)
+        command = Command(
+            t_ns, given[0], given[1], given[0], given[1], LONGEST_COMMAND_S, in_force=known, source=SOURCE
         )
-
-
-def _wheels(drive: DriveLog) -> Iterator[_Timed]:
-    part = drive.wheels
-    columns = (part.left_angle_rad, part.right_angle_rad, part.left_speed_rad_s, part.right_speed_rad_s)
-    values = zip(*(column.tolist() for column in columns), strict=True)
-    for t_s, segment, row in zip(part.t_s.tolist(), part.segment.tolist(), values, strict=True):
-        t_ns = _ns(t_s)
-        yield t_ns, segment, WheelSample(t_ns, t_ns, *row)
-
-
-def _poses(drive: DriveLog) -> Iterator[_Timed]:
-    part = drive.poses
-    columns = (part.t_s, part.segment, part.x_m, part.y_m, part.yaw_rad)
-    for t_s, segment, x_m, y_m, yaw_rad in zip(*(column.tolist() for column in columns), strict=True):
-        t_ns = _ns(t_s)
-        yield t_ns, segment, PoseSample(t_ns, t_ns, x_m, y_m, yaw_rad, math.nan, math.nan)
+        found.append((t_ns, segment, command))
+    for t_s, *values, segment in rows(drive.wheels):
+        found.append((_ns(t_s), segment, WheelSample(_ns(t_s), _ns(t_s), *values)))
+    for t_s, x_m, y_m, yaw_rad, segment in rows(drive.poses):
+        found.append((_ns(t_s), segment, PoseSample(_ns(t_s), _ns(t_s), x_m, y_m, yaw_rad, math.nan, math.nan)))
+    return sorted(found, key=lambda sample: sample[0])
 
 
 def _ns(t_s: float) -> int:

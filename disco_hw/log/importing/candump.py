@@ -20,7 +20,7 @@ import numpy as np
 from disco_hw.config import Robot
 from disco_hw.errors import LogError
 from disco_hw.files import CANDUMP, read_lines
-from disco_hw.log.drive import Array, Commands, DriveLog, Index, Poses, Wheels, after_silences, in_segments
+from disco_hw.log.drive import DriveLog, Index, Samples, drive_of
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.losses import loss_note, warnings_first
 from drivers.device_clock import DeviceClock
@@ -216,7 +216,8 @@ def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str
                 "failed their check and were left out", "look for a second sender, or name another channel",
             )
         )  # fmt: skip
-    return _drive(path, _expired(rows.commands), rows.wheels, rows.poses, warnings_first(tuple(notes)))
+    commands, wheels, poses = _samples(_expired(rows.commands), 3), _samples(rows.wheels, 5), _samples(rows.poses, 4)
+    return drive_of(str(path), commands, wheels, poses, notes=warnings_first(tuple(notes)))
 
 
 def _decoded(dump: Dump, channel: str, robot: Robot) -> _Rows:
@@ -261,27 +262,11 @@ def _expired(commands: list[Row]) -> list[Row]:
     return rows
 
 
-def _drive(path: Path, commands: list[Row], wheels: list[Row], poses: list[Row], notes: tuple[str, ...]) -> DriveLog:
-    began_ns = min(rows[0][0] for rows in (commands, wheels, poses) if rows)
-    command, wheel, pose = _table(commands, 3), _table(wheels, 5), _table(poses, 4)
-    wheel_ns = wheel[:, 0]
-    when = in_segments(began_ns, after_silences(wheel_ns))
-    (command_s, command_segment), (wheel_s, wheel_segment) = when(command[:, 0]), when(wheel_ns)
-    pose_s, pose_segment = when(pose[:, 0])
-    measured = bool(wheel_s.size)
-    return DriveLog(
-        (str(path),),
-        Commands(command_s, command[:, 1], command[:, 2], command_segment),
-        Wheels(wheel_s, wheel[:, 1], wheel[:, 2], wheel[:, 3], wheel[:, 4], wheel_segment, measured, measured),
-        Poses(pose_s, pose[:, 1], pose[:, 2], pose[:, 3], pose_segment),
-        notes=notes,
-    )
-
-
-def _table(rows: list[Row], width: int) -> Array:
-    """Rows as an array (N, width) in order of time, the last of several with one time."""
+def _samples(rows: list[Row], width: int) -> Samples:
+    """Return rows (N, width) that begin with their time in order of time, the last of several with one time."""
     table = np.array(rows, dtype=np.float64).reshape(-1, width)
-    return table[np.append(np.diff(table[:, 0]) > 0.0, True)] if rows else table
+    table = table[np.append(np.diff(table[:, 0]) > 0.0, True)] if rows else table
+    return table[:, 0], table[:, 1:]
 
 
 FORMAT = LogFormat(

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+
+from disco_hw.errors import LogError
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -82,10 +84,9 @@ class _Steps:
 def unwrap_counter(
     t_s: Array,
     values: Array,
-    spans: Sequence[float] = (),
-    *,
-    begins: Mask | None = None,
-    speeds: Array | None = None,
+    spans: Sequence[float],
+    begins: Mask,
+    speeds: Array,
     unit: str = "counts",
 ) -> Unwrapped:
     """Make a counter continuous that jumps by a constant span whenever it overflows.
@@ -106,33 +107,47 @@ def unwrap_counter(
     span = _span_of(motion, [each for each in usual if reach < each <= 2.0 * reach], reach, unit)
     if span is not None:
         if _is_too_fast(motion, speeds, span):
-            return Unwrapped(values, unchanged.uncertain, fault=_faster_than_read(span, unit))
+            return replace(unchanged, fault=_faster_than_read(span, unit))
         found = _without_wraps(motion, values, span)
         if found is not None:
             return found
-    return Unwrapped(values, unchanged.uncertain, fault=_too_fast(motion, speeds, reach, usual, unit))
+    return replace(unchanged, fault=_too_fast(motion, speeds, reach, usual, unit))
 
 
-def unwrap_wheels(
-    t_s: Array, values: Array, spans: Sequence[float], begins: Mask, speeds: Array, unit: str = "counts"
-) -> tuple[Unwrapped, Unwrapped]:
+def continuous_wheels(
+    names: tuple[str, str],
+    t_s: Array,
+    values: Array,
+    spans: Sequence[float],
+    begins: Mask,
+    speeds: Array,
+    notes: list[str],
+    unit: str = "counts",
+) -> tuple[Array, Mask]:
     """Make the counters of both wheels continuous, `values` and `speeds` (N, 2); each wheel is judged by itself.
 
-    The counters are of one kind: a span that one wheel shows is tried on the other, which may wrap too rarely.
+    Also returns where the number of wraps is not known, (N,). The counters are of one kind: a span that one wheel shows
+    is tried on the other, which may wrap too rarely. `names` begin with the file's. Raises LogError for a counter that
+    cannot be made continuous.
     """
 
     def unwrap(side: int, spans: Sequence[float]) -> Unwrapped:
-        return unwrap_counter(t_s, values[:, side], spans, begins=begins, speeds=speeds[:, side], unit=unit)
+        return unwrap_counter(t_s, values[:, side], spans, begins, speeds[:, side], unit)
 
     first = unwrap(0, spans), unwrap(1, spans)
     shown = [*spans, *(one.span for one in first if one.wraps)]
     left, right = (one if one.wraps or one.fault else unwrap(side, shown) for side, one in enumerate(first))
-    return left, right
+    for name, one in zip(names, (left, right), strict=True):
+        if one.fault:
+            raise LogError(f"{name}: {one.fault}")
+        if one.wraps:
+            notes.append(f"{name} wraps at {one.span:.10g} {unit}: made continuous at {one.wraps} places")
+    return np.column_stack([left.values, right.values]), left.uncertain | right.uncertain
 
 
-def _steps(t_s: Array, values: Array, begins: Mask | None, reach: float, unit: str) -> _Steps:
+def _steps(t_s: Array, values: Array, begins: Mask, reach: float, unit: str) -> _Steps:
     dt_s, steps = np.maximum(np.diff(t_s), 1e-9), np.diff(values)
-    inside = np.ones(steps.size, dtype=bool) if begins is None else ~begins[1:]
+    inside = ~begins[1:]
     jumps = inside & (np.abs(steps) > _JUMP_SHARE * reach) & (reach > 0.0)
     usable = inside & ~jumps
     expected = _expected(dt_s, steps, usable)
@@ -229,31 +244,26 @@ def _without_wraps(motion: _Steps, values: Array, span: float) -> Unwrapped | No
     )
 
 
-def _is_too_fast(motion: _Steps, speeds: Array | None, span: float) -> bool:
+def _is_too_fast(motion: _Steps, speeds: Array, span: float) -> bool:
     """Whether speeds (N,) carry a counter over half its span from one value to the next, more than now and then."""
-    if speeds is None:
-        return False
     lengths = np.abs(speeds[:-1]) * motion.dt_s
     known = motion.is_inside & np.isfinite(lengths)
     too_long = int(np.count_nonzero(lengths[known] > 0.5 * span))
     return too_long > _TOO_FAST_SHARE * int(np.count_nonzero(known))
 
 
-def _too_fast(motion: _Steps, speeds: Array | None, reach: float, spans: Sequence[float], unit: str) -> str:
+def _too_fast(motion: _Steps, speeds: Array, reach: float, spans: Sequence[float], unit: str) -> str:
     """Describe a counter that wraps within so few samples that its direction is unknown; empty if none does."""
     if np.mean(motion.is_jump) <= _JUMPS_ALL_THE_TIME_SHARE:
         return ""
+    # How far speeds that are known carry the wheel, to and fro.
+    driven = float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s))
     for span in spans:
         if _FULL_SHARE * span <= reach < span:
             shortest = np.abs(motion.steps - span * np.round(motion.steps / span))
-            if np.quantile(shortest, 0.75) > _AMBIGUOUS_SHARE * span or _is_driven_over(motion, speeds, 2.0 * span):
+            if np.quantile(shortest, 0.75) > _AMBIGUOUS_SHARE * span or driven > 2.0 * span:
                 return _faster_than_read(span, unit)
     return ""
-
-
-def _is_driven_over(motion: _Steps, speeds: Array | None, length: float) -> bool:
-    """Whether speeds (N,) that are known carry a wheel over a length, to and fro."""
-    return speeds is not None and float(np.nansum(np.abs(speeds[:-1]) * motion.dt_s)) > length
 
 
 def _faster_than_read(span: float, unit: str) -> str:

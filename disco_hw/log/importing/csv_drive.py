@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
@@ -31,7 +32,7 @@ from disco_hw.log.drive import (
     integrate_angle,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import Mask, restarts, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import Mask, continuous_wheels, restarts
 from disco_hw.log.importing.csv_sheet import (
     COMMAND,
     GYRO,
@@ -200,7 +201,11 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
         raise LogError(f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give --robot ROBOT.toml")
     t_s = sheet.t_s[has_ticks]
     per_rad = ticks_per_rev / (2.0 * math.pi)
-    counts, uncertain = _continuous(sheet, ticks[has_ticks], has_ticks, per_rad, notes)
+    begins = np.concatenate([[True], np.diff(sheet.segment[has_ticks]) != 0])
+    measured, commanded = (sheet.group(names)[0][has_ticks] * per_rad for names in (SPEED, COMMAND))
+    known = np.where(np.isfinite(measured), measured, commanded)
+    names = (f"{sheet.name}: {TICKS[0]}", f"{sheet.name}: {TICKS[1]}")
+    counts, uncertain = continuous_wheels(names, t_s, ticks[has_ticks], (ticks_per_rev,), begins, known, notes)
     angles = counts * (2.0 * math.pi / ticks_per_rev)
     sheet = _with_new_segments(sheet, t_s, angles, uncertain, sheet.segment[has_ticks], notes)
     segment = sheet.segment[has_ticks]
@@ -215,47 +220,24 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
     return sheet, Wheels(t_s, angles[:, 0], angles[:, 1], left, right, segment, True, both)
 
 
-def _continuous(sheet: Sheet, ticks: Array, has_ticks: Mask, per_rad: float, notes: list[str]) -> tuple[Array, Mask]:
-    """Ticks (N, 2) of which none wraps, each wheel judged by itself; and where the number of wraps is not known, (N,).
-
-    `has_ticks` are the sheet's rows of the N ticks, `per_rad` the ticks of a radian.
-    """
-    t_s, segment = sheet.t_s[has_ticks], sheet.segment[has_ticks]
-    begins = np.concatenate([[True], np.diff(segment) != 0])
-    measured, commanded = (sheet.group(names)[0][has_ticks] * per_rad for names in (SPEED, COMMAND))
-    speeds = np.where(np.isfinite(measured), measured, commanded)
-
-    found = unwrap_wheels(t_s, ticks, (2.0 * math.pi * per_rad,), begins, speeds)
-    for name, one in zip(TICKS, found, strict=True):
-        if one.fault:
-            raise LogError(f"{sheet.name}: {name}: {one.fault}")
-        if one.wraps:
-            notes.append(f"{sheet.name}: {name} wraps at {one.span:.10g}: made continuous at {one.wraps} places")
-    return np.column_stack([one.values for one in found]), found[0].uncertain | found[1].uncertain
-
-
 def _with_new_segments(
     sheet: Sheet, t_s: Array, angles: Array, uncertain: Mask, segment: Index, notes: list[str]
 ) -> Sheet:
     """Return the sheet with a new segment wherever an encoder restarts or may have wrapped."""
     inside = np.concatenate([[False], np.diff(segment) == 0])
     restart, uncertain = restarts(t_s, angles) & ~uncertain & inside, uncertain & inside
-    count, unknown = int(np.count_nonzero(restart)), int(np.count_nonzero(uncertain))
-    if count > _MAX_RESTART_SHARE * t_s.size:
+    if np.count_nonzero(restart) > _MAX_RESTART_SHARE * t_s.size:
         raise LogError(
-            f"{sheet.name}: an encoder jumps {count} times, first at t_s {t_s[restart][0]:.9g}, further than a "
-            f"wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
+            f"{sheet.name}: an encoder jumps {np.count_nonzero(restart)} times, first at t_s {t_s[restart][0]:.9g}, "
+            f"further than a wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
-    if count:
-        notes.append(
-            f"{sheet.name}: an encoder was reset {count} times, first at t_s {t_s[restart][0]:.9g}; new segments "
-            "begin there"
-        )
-    if unknown:
-        notes.append(
-            f"{sheet.name}: ticks are missing for so long that they may have wrapped unseen, {unknown} times, first "
-            f"at t_s {t_s[uncertain][0]:.9g}; new segments begin there"
-        )
+    for which, what in (
+        (restart, "an encoder was reset"),
+        (uncertain, "ticks are missing for so long that they may have wrapped unseen,"),
+    ):
+        if which.any():
+            times = f"{np.count_nonzero(which)} times, first at t_s {t_s[which][0]:.9g}"
+            notes.append(f"{sheet.name}: {what} {times}; new segments begin there")
     breaks_s = t_s[restart | uncertain]
     return replace(sheet, segment=sheet.segment + np.searchsorted(breaks_s, sheet.t_s, side="right"))
 
@@ -275,9 +257,6 @@ FORMAT = LogFormat(
 )
 
 
-Cells = Callable[[float], list[str]]
-
-
 def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     """Write one row for each time at which anything was recorded; return the number of rows.
 
@@ -285,23 +264,27 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     sample at that time. With `ticks_per_rev` the wheel angles are written as ticks. Raises LogError if the file exists
     or cannot be written.
     """
-    wheels, poses = drive.wheels, drive.poses
-    groups: list[tuple[tuple[str, ...], Cells]] = [
-        (COMMAND, _in_force(drive)),
-        (SPEED, _at(wheels.t_s, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), repr)),
-        ((*POSITION, YAW), _at(poses.t_s, (poses.x_m, poses.y_m, poses.yaw_rad), repr)),
-    ]
+    commands, wheels, poses = drive.commands, drive.wheels, drive.poses
+    parts = (commands, wheels, poses)
+    times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
+    segments = np.concatenate([part.segment for part in parts])[first]
+    last_command = np.searchsorted(commands.t_s, times, side="right") - 1
+    in_force = np.vstack([np.column_stack([commands.left_rad_s, commands.right_rad_s]), [np.nan, np.nan]])[last_command]
+    in_force[np.isnan(in_force).any(axis=1)] = np.nan
+    table = dict(zip(COMMAND, ([_cell(value) for value in column] for column in in_force.T.tolist()), strict=True))
     if ticks_per_rev is not None and wheels.angle_measured:
         per_rad = ticks_per_rev / (2.0 * math.pi)
-        ticks = (np.rint(wheels.left_angle_rad * per_rad), np.rint(wheels.right_angle_rad * per_rad))
-        groups.insert(1, (TICKS, _at(wheels.t_s, ticks, lambda value: str(int(value)))))
-    times, segments = _rows(drive)
+        for name, angle_rad in zip(TICKS, (wheels.left_angle_rad, wheels.right_angle_rad), strict=True):
+            table[name] = _cells(times, wheels.t_s, np.rint(angle_rad * per_rad).astype(np.int64))
+    for name, speed_rad_s in zip(SPEED, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), strict=True):
+        table[name] = _cells(times, wheels.t_s, speed_rad_s)
+    for name, value in zip((*POSITION, YAW), (poses.x_m, poses.y_m, poses.yaw_rad), strict=True):
+        table[name] = _cells(times, poses.t_s, value)
     try:
         with path.open("x", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow([TIME, *(name for names, _ in groups for name in names), SEGMENT])
-            for t_s, segment in zip(times.tolist(), segments.tolist(), strict=True):
-                writer.writerow([repr(t_s), *(cell for _, cells in groups for cell in cells(t_s)), segment])
+            writer.writerow([TIME, *table, SEGMENT])
+            writer.writerows(zip(map(repr, times.tolist()), *table.values(), segments.tolist(), strict=True))
     except FileExistsError:
         raise LogError(f"{path}: already exists; give another name") from None
     except OSError as error:
@@ -311,33 +294,13 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     return times.size
 
 
-def _rows(drive: DriveLog) -> tuple[Array, Index]:
-    """Return all times in order, and their segments."""
-    parts = (drive.commands, drive.wheels, drive.poses)
-    times, first = np.unique(np.concatenate([part.t_s for part in parts]), return_index=True)
-    return times, np.concatenate([part.segment for part in parts])[first]
-
-
-def _at(t_s: Array, columns: tuple[Array, ...], text: Callable[[float], str]) -> Cells:
-    """Return a function from a time to its cells: the samples at exactly that time, empty if there is none."""
-    rows = dict(zip(t_s.tolist(), zip(*(column.tolist() for column in columns), strict=True), strict=True))
-    nothing = [""] * len(columns)
-
-    def cells(time: float) -> list[str]:
-        values = rows.get(time)
-        return nothing if values is None else [text(value) for value in values]
-
+def _cells(times: Array, t_s: Array, values: NDArray[Any]) -> list[str]:
+    """Return a column of the table: the samples at exactly these times, empty where there is none."""
+    cells = [""] * times.size
+    for place, value in zip(np.searchsorted(times, t_s).tolist(), values.tolist(), strict=True):
+        cells[place] = repr(value)
     return cells
 
 
-def _in_force(drive: DriveLog) -> Cells:
-    """Return a function from a time to its command cells: the latest command, empty if none is known."""
-    commands = drive.commands
-
-    def cells(time: float) -> list[str]:
-        at = int(np.searchsorted(commands.t_s, time, side="right")) - 1
-        if at < 0 or math.isnan(commands.left_rad_s[at]):
-            return ["", ""]
-        return [repr(float(commands.left_rad_s[at])), repr(float(commands.right_rad_s[at]))]
-
-    return cells
+def _cell(value: float) -> str:
+    return "" if math.isnan(value) else repr(value)

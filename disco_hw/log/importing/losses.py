@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
-from disco_hw.log.drive import DriveLog, Poses, Wheels
+from disco_hw.log.drive import DriveLog, Poses, Wheels, chosen
 
 WARNING = "warning: "
 """Notes that begin with this are printed before everything else."""
@@ -94,8 +94,4 @@ def with_headings_only(drive: DriveLog) -> DriveLog:
         f"{WARNING}{', '.join(drive.sources)}: {count} of {measured.size} positions have no heading and were left out: "
         "what needs poses needs a source that measures the heading"
     )
-    poses = drive.poses
-    kept = Poses(
-        poses.t_s[measured], poses.x_m[measured], poses.y_m[measured], poses.yaw_rad[measured], poses.segment[measured]
-    )
-    return replace(drive, poses=kept, notes=(note, *drive.notes))
+    return replace(drive, poses=chosen(drive.poses, measured), notes=(note, *drive.notes))

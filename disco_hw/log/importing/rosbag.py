@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,24 +16,23 @@ from disco_hw.config import Robot, RobotConfig
 from disco_hw.errors import LogError
 from disco_hw.log.drive import (
     LONGEST_COMMAND_S,
+    LONGEST_SILENCE_NS,
     Array,
-    Commands,
     DriveLog,
     Edge,
     Index,
     Motion,
-    Poses,
     after_silences,
-    in_segments,
+    drive_of,
     poses,
     rotations,
 )
 from disco_hw.log.importing import LogFormat
-from disco_hw.log.importing.counter_wrap import restarts
+from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, continuous_wheels, restarts
 from disco_hw.log.importing.csv_drive import length_fault
 from disco_hw.log.importing.losses import WARNING, loss_note
 from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, message_of, open_bag
-from disco_hw.log.importing.rosbag_times import Stamps, timeline
+from disco_hw.log.importing.rosbag_times import Column, alike, timeline
 from disco_hw.log.importing.rosbag_topics import (
     ARRAY,
     COMMANDS,
@@ -49,7 +48,6 @@ from disco_hw.log.importing.rosbag_topics import (
     Choice,
     choose,
 )
-from disco_hw.log.importing.rosbag_wheels import measured_columns, unwrapped, wheels_of
 from drivers.pose import is_heading_measured
 
 _LONGEST_COMMAND_NS = round(LONGEST_COMMAND_S * 1e9)
@@ -59,36 +57,6 @@ _LONGEST_PAUSE_NS = 2_000_000_000
 _MOST_MESSAGES = 20_000_000
 _YAW_VARIANCE = 35
 """Place of the yaw's variance among the 36 of a pose's covariance."""
-
-
-@dataclass(slots=True)
-class _Column:
-    """Samples collected from one topic, or from one edge of the transforms."""
-
-    width: int
-    log_ns: array[int] = field(default_factory=lambda: array("q"))
-    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
-    values: array[float] = field(default_factory=lambda: array("d"))
-    left_out: int = 0
-
-    def add(self, log_ns: int, stamp_ns: int, row: Row | None) -> None:
-        """Keep a row, or count that there was none."""
-        if row is None:
-            self.left_out += 1
-            return
-        self.log_ns.append(log_ns)
-        self.stamp_ns.append(stamp_ns)
-        self.values.extend(row)
-
-    def stamps(self) -> Stamps:
-        """Return the times of its rows."""
-        table = self.table()
-        is_repeat = np.concatenate([[False], _alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
-        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
-
-    def table(self) -> Array:
-        """Return the column's rows, (N, width)."""
-        return np.array(self.values, dtype=np.float64).reshape(-1, self.width)
 
 
 def read_rosbag(path: Path, config: RobotConfig) -> DriveLog:
@@ -128,18 +96,18 @@ def _notes_on_undecoded(bag: Bag, undecoded: dict[str, Undecoded]) -> list[str]:
     ]  # fmt: skip
 
 
-def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str, Undecoded]) -> dict[str, _Column]:
+def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str, Undecoded]) -> dict[str, Column]:
     """One pass through the chosen topics; messages that cannot be decoded are counted."""
-    columns: dict[str, _Column] = {}
+    columns: dict[str, Column] = {}
     takes: dict[str, list[tuple[str, ReadRow]]] = {}
     for role in ROLES:
         used = choice.used(role)
         if used is not None and used.topic != TF:
             width, read_row = row_reader(role, used.type, choice, config)
-            columns[role] = _Column(width)
+            columns[role] = Column(width)
             takes.setdefault(used.topic, []).append((role, read_row))
     by_tf = choice.used(POSES) is not None and POSES not in columns
-    edges = {edge: _Column(7) for edge in choice.edges} if by_tf else {}
+    edges = {edge: Column(7) for edge in choice.edges} if by_tf else {}
     static: set[Edge] = set()
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
     for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
@@ -157,7 +125,9 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
             for one in message.value.transforms:
                 edge = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
                 if edge in edges:
-                    edges[edge].add(message.log_ns, stamp_of(one), finite(transform_row(one.transform)))
+                    edges[edge].add(
+                        message.log_ns, stamp_of(one), finite(_place(one.transform.translation, one.transform.rotation))
+                    )
                     if message.topic.endswith("static"):
                         static.add(edge)
     return columns | {_edge_name(edge, edge in static): column for edge, column in edges.items()}
@@ -167,7 +137,7 @@ def _edge_name(edge: Edge, static: bool) -> str:
     return f"{'/tf_static' if static else '/tf'} {edge[0]} - {edge[1]}"
 
 
-def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: Robot) -> DriveLog:
+def _assembled(path: Path, choice: Choice, columns: dict[str, Column], robot: Robot) -> DriveLog:
     notes = [choice.as_text()]
     for name, column in columns.items():
         used = choice.used(name)
@@ -186,17 +156,16 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
     nothing: tuple[Index, Array] = (np.empty(0, dtype=np.int64), np.empty((0, 4)))
     command_ns, command = _expired(*arrays.get(COMMANDS, (nothing[0], np.empty((0, 2)))))
     wheel_ns, wheel = arrays.get(WHEELS, nothing)
-    wheel_ns, wheel, measured = measured_columns(path, wheel_ns, wheel, notes)
+    wheel_ns, wheel, measured = _measured_rows(path, wheel_ns, wheel, notes)
     uncertain = np.zeros(wheel_ns.size, dtype=bool)
     if measured[0]:
-        wheel, uncertain = unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
-    began_ns = min(int(t_ns[0]) for t_ns in (command_ns, wheel_ns, pose_ns) if t_ns.size)
+        wheel, uncertain = _unwrapped(path, wheel_ns, wheel, robot, (command_ns, command), notes)
     breaks_ns = np.unique(
         np.concatenate(
             [
                 times.breaks_ns,
                 _pauses(wheel_ns, (command_ns, pose_ns)),
-                wheel_ns[restarts((wheel_ns - began_ns).astype(np.float64) * 1e-9, wheel[:, :2]) | uncertain],
+                wheel_ns[restarts(np.asarray((wheel_ns - wheel_ns[:1]) * 1e-9), wheel[:, :2]) | uncertain],
             ]
         )
     )
@@ -204,19 +173,14 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, _Column], robot: R
         notes.append(
             f"{breaks_ns.size} times the wheels paused, or a clock or encoder was set; new segments begin there"
         )
-    when = in_segments(began_ns, breaks_ns)
-    (command_s, command_segment), (pose_s, pose_segment) = when(command_ns), when(pose_ns)
-    commands = Commands(command_s, command[:, 0], command[:, 1], command_segment)
-    wheels = wheels_of(*when(wheel_ns), wheel, measured)
-    drive_poses = Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment)
-    fault = length_fault(drive_poses, wheels, commands, robot.wheel_radius_m)
+    drive = drive_of(str(path), (command_ns, command), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, measured)
+    fault = length_fault(drive.poses, drive.wheels, drive.commands, robot.wheel_radius_m)
     if fault is not None:
         notes.append(f"poses and wheels do not fit together: {fault.rpartition(';')[0]}; see which topics were read")
-    notes += _of_the_choice(choice)
-    return DriveLog((str(path),), commands, wheels, drive_poses, notes=tuple(notes))
+    return replace(drive, notes=(*notes, *_notes_on_types(choice)))
 
 
-def _of_the_choice(choice: Choice) -> list[str]:
+def _notes_on_types(choice: Choice) -> list[str]:
     """Return notes on what the types of the chosen topics mean for the results."""
     notes = []
     command, wheel = choice.used(COMMANDS), choice.used(WHEELS)
@@ -244,22 +208,17 @@ def _of_the_choice(choice: Choice) -> list[str]:
 def _ordered(path: Path, name: str, t_ns: Index, table: Array, notes: list[str]) -> tuple[Index, Array]:
     """Sort messages by time, and keep the first of several with one time; one that is sent again is no loss."""
     unique, first, place = np.unique(t_ns, return_index=True, return_inverse=True)
-    conflicts = int(np.count_nonzero(~_alike(table, table[first][place])))
+    conflicts = int(np.count_nonzero(~alike(table, table[first][place])))
     if conflicts:
         what = "messages have the time of another and were left out"
         notes.append(loss_note(str(path), name, conflicts, t_ns.size, what, "record it again, or name another topic"))
     return unique, table[first]
 
 
-def _alike(one: Array, other: Array) -> NDArray[np.bool_]:
-    """Whether the rows of two tables (N, k) hold the same values."""
-    return np.asarray(((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1))
-
-
 def _pose_table(
     path: Path,
     choice: Choice,
-    columns: dict[str, _Column],
+    columns: dict[str, Column],
     arrays: dict[str, tuple[Index, Array]],
     static: set[str],
     notes: list[str],
@@ -289,6 +248,51 @@ def _pose_table(
     if not t_ns.size:
         raise LogError(f"{path}: the transforms of {used.why} never overlap in time; name another topic for poses")
     return t_ns, table
+
+
+def _measured_rows(path: Path, t_ns: Index, wheel: Array, notes: list[str]) -> tuple[Index, Array, tuple[bool, bool]]:
+    """Rows in which everything is there that the wheels measure at all, and whether that is angles, and speeds."""
+    angles, speeds = (np.isfinite(wheel[:, part]).all(axis=1) for part in (slice(0, 2), slice(2, 4)))
+    has_angle, has_speed = (
+        bool(2 * np.count_nonzero(angles) > t_ns.size),
+        bool(2 * np.count_nonzero(speeds) > t_ns.size),
+    )
+    kept = (angles | (not has_angle)) & (speeds | (not has_speed))
+    if t_ns.size and not (has_angle or has_speed):
+        raise LogError(
+            f"{path}: wheels: most messages have neither position nor velocity of all wheels; "
+            "set ros2.left_joints and ros2.right_joints"
+        )
+    if not kept.all():
+        dropped, what = int(np.count_nonzero(~kept)), "messages lack a position or velocity and were left out"
+        notes.append(
+            loss_note(str(path), WHEELS, dropped, kept.size, what, "set ros2.left_joints and ros2.right_joints")
+        )
+    wheel = wheel[kept]
+    if has_angle and has_speed and (wheel[:, 2:] == 0.0).all() and np.ptp(wheel[:, 0]) > 1.0:
+        notes.append("wheels: the velocities are all zero while the wheels turn; they were taken from the positions")
+        has_speed = False
+    return t_ns[kept], wheel, (has_angle, has_speed)
+
+
+def _unwrapped(
+    path: Path, t_ns: Index, wheel: Array, robot: Robot, commands: tuple[Index, Array], notes: list[str]
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Wheels whose angles are continuous; and where the number of wraps is not known, (N,).
+
+    Angles wrap at a turn or where the counter behind them overflows; each wheel is judged by itself.
+    """
+    # Before the first command nothing is known.
+    commanded = np.vstack([[np.nan, np.nan], commands[1]])[np.searchsorted(commands[0], t_ns, side="right")]
+    known = np.where(np.isfinite(wheel[:, 2:]), wheel[:, 2:], commanded)
+    tick_rad = 2.0 * math.pi / robot.ticks_per_rev
+    spans = (2.0 * math.pi, *(2.0**bits * tick_rad for bits in WIDTHS_BITS))
+    begins = np.concatenate([[True], np.diff(t_ns) > LONGEST_SILENCE_NS])
+    names = (f"{path}: left wheel", f"{path}: right wheel")
+    angles, uncertain = continuous_wheels(
+        names, (t_ns - t_ns[0]) * 1e-9, wheel[:, :2], spans, begins, known, notes, "rad"
+    )
+    return np.column_stack([angles, wheel[:, 2:]]), uncertain
 
 
 def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
@@ -329,72 +333,50 @@ def stamp_of(message: Any) -> int:
 def row_reader(role: str, kind: str, choice: Choice, config: RobotConfig) -> tuple[int, ReadRow]:
     """Return how many numbers a message of this type gives in this role, and the function that reads them."""
     if role == POSES:
-        return 7, _odometry_pose if kind == ODOMETRY else _measured_pose
+        return 7, _pose_row
     if role == WHEELS:
-        return 4, _joint_wheels(choice) if kind == JOINTS else _odometry_wheels(config.robot)
+        return 4, partial(_joint_wheels, choice) if kind == JOINTS else partial(_odometry_wheels, config.robot)
     if kind == JOINTS:
-        return 2, _joint_command(choice)
+        return 2, partial(_joint_command, choice)
     if kind == ARRAY:
-        return 2, _array_command(choice, config.ros2.command_joints)
+        return 2, partial(_array_command, choice, config.ros2.command_joints)
     if kind in TWIST:
-        return 2, _twist_command(config.robot)
+        return 2, lambda message: _wheel_pair(config.robot, getattr(message, "twist", message))
     return 2, _drivers if DRIVERS.fullmatch(kind) else _wheel_speeds
 
 
-def _wheel_pair(robot: Robot, forward: float, turning: float) -> Row:
+def _wheel_pair(robot: Robot, twist: Any) -> Row:
     """Left and right wheel speeds of a motion, rad/s."""
-    half = 0.5 * robot.axial_distance_m * turning
+    forward, half = float(twist.linear.x), 0.5 * robot.axial_distance_m * float(twist.angular.z)
     return (forward - half) / robot.wheel_radius_m, (forward + half) / robot.wheel_radius_m
 
 
-def _twist_command(robot: Robot) -> ReadRow:
-    def read_row(message: Any) -> Row:
-        twist = getattr(message, "twist", message)
-        return _wheel_pair(robot, float(twist.linear.x), float(twist.angular.z))
-
-    return read_row
-
-
 def _mean_of(values: Any, names: Sequence[str], joints: Sequence[str]) -> float:
-    """Mean over several joints; NaN where the array does not hold one of them."""
+    """Mean over several joints; NaN where the array does not hold one of them, or nobody knows which they are."""
     found = [float(values[names.index(name)]) for name in joints if names.index(name) < len(values)]
-    return sum(found) / len(found) if len(found) == len(joints) else math.nan
+    return sum(found) / len(found) if found and len(found) == len(joints) else math.nan
 
 
-def _joint_wheels(choice: Choice) -> ReadRow:
-    joints = {*choice.left_joints, *choice.right_joints}
-
-    def read_row(message: Any) -> Row | None:
-        names = list(message.name)
-        # Other joints of the robot may come in messages of their own.
-        if not joints <= set(names):
-            return None
-        sides = (choice.left_joints, choice.right_joints)
-        return tuple(_mean_of(values, names, side) for values in (message.position, message.velocity) for side in sides)
-
-    return read_row
+def _joint_wheels(choice: Choice, message: Any) -> Row | None:
+    names, sides = list(message.name), (choice.left_joints, choice.right_joints)
+    # Other joints of the robot may come in messages of their own.
+    if not {*sides[0], *sides[1]} <= set(names):
+        return None
+    return tuple(_mean_of(values, names, side) for values in (message.position, message.velocity) for side in sides)
 
 
-def _joint_command(choice: Choice) -> ReadRow:
-    def read_row(message: Any) -> Row | None:
-        names = list(message.name)
-        if not {*choice.left_joints, *choice.right_joints} <= set(names):
-            return None
-        if not len(message.velocity):
-            # No speed: from here on nothing is commanded.
-            return math.nan, math.nan
-        return tuple(_mean_of(message.velocity, names, side) for side in (choice.left_joints, choice.right_joints))
-
-    return read_row
+def _joint_command(choice: Choice, message: Any) -> Row | None:
+    names, sides = list(message.name), (choice.left_joints, choice.right_joints)
+    if not all(sides) or not {*sides[0], *sides[1]} <= set(names):
+        return None
+    # Without a speed nothing is commanded from here on.
+    return tuple(_mean_of(message.velocity, names, side) for side in sides)
 
 
-def _array_command(choice: Choice, joints: Sequence[str]) -> ReadRow:
-    def read_row(message: Any) -> Row | None:
-        if not joints:
-            return (float(message.data[0]), float(message.data[1])) if len(message.data) == 2 else None
-        return tuple(_mean_of(message.data, list(joints), side) for side in (choice.left_joints, choice.right_joints))
-
-    return read_row
+def _array_command(choice: Choice, joints: Sequence[str], message: Any) -> Row | None:
+    if not joints:
+        return (float(message.data[0]), float(message.data[1])) if len(message.data) == 2 else None
+    return tuple(_mean_of(message.data, list(joints), side) for side in (choice.left_joints, choice.right_joints))
 
 
 def _drivers(message: Any) -> Row | None:
@@ -406,43 +388,24 @@ def _wheel_speeds(message: Any) -> Row:
     return float(message.velocity_left), float(message.velocity_right)
 
 
-def _odometry_wheels(robot: Robot) -> ReadRow:
-    def read_row(message: Any) -> Row:
-        twist = message.twist.twist
-        return (math.nan, math.nan, *_wheel_pair(robot, float(twist.linear.x), float(twist.angular.z)))
-
-    return read_row
+def _odometry_wheels(robot: Robot, message: Any) -> Row:
+    return (math.nan, math.nan, *_wheel_pair(robot, message.twist.twist))
 
 
-def _odometry_pose(message: Any) -> Row | None:
-    return _with_measured_heading(message.pose.pose, message.pose.covariance)
-
-
-def _measured_pose(message: Any) -> Row | None:
-    if hasattr(message.pose, "covariance"):
-        return _with_measured_heading(message.pose.pose, message.pose.covariance)
-    return _space(message.pose)
-
-
-def _with_measured_heading(pose: Any, covariance: Any) -> Row | None:
+def _pose_row(message: Any) -> Row | None:
     """Position and quaternion (7,); the quaternion is NaN where the message says that nobody measured the heading."""
-    row = _space(pose)
+    if not hasattr(message.pose, "covariance"):
+        return _place(message.pose.position, message.pose.orientation)
+    row = _place(message.pose.pose.position, message.pose.pose.orientation)
     if row is None:
         return None
     yaw_rad = math.atan2(2.0 * (row[6] * row[5] + row[3] * row[4]), 1.0 - 2.0 * (row[4] ** 2 + row[5] ** 2))
-    return row if is_heading_measured(yaw_rad, float(covariance[_YAW_VARIANCE])) else (*row[:3], *[math.nan] * 4)
-
-
-def _space(pose: Any) -> Row | None:
-    return _place(pose.position, pose.orientation)
-
-
-def transform_row(transform: Any) -> Row | None:
-    """Position and quaternion (7,) of a transform."""
-    return _place(transform.translation, transform.rotation)
+    measured = is_heading_measured(yaw_rad, float(message.pose.covariance[_YAW_VARIANCE]))
+    return row if measured else (*row[:3], *[math.nan] * 4)
 
 
 def _place(position: Any, rotation: Any) -> Row | None:
+    """Position and quaternion (7,)."""
     row = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
     length = math.hypot(*row[3:])
     # A quaternion of zeros is what a publisher leaves that never set it.

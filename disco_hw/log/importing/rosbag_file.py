@@ -163,9 +163,8 @@ def open_bag(path: Path, *, salvage: bool = False) -> Iterator[Bag]:
             topics = _topics(path, readers)
             start_ns = min(reader.start_time for reader in readers)
             end_ns = max(reader.end_time for reader in readers)
-        yield Bag(
-            path, topics, start_ns, end_ns, tuple(notes), tuple(readers), _decoder(store, is_ros1), Definitions(store)
-        )
+        read = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+        yield Bag(path, topics, start_ns, end_ns, tuple(notes), tuple(readers), read, Definitions(store))
 
 
 def _readers(path: Path, stack: ExitStack, notes: list[str], salvage: bool) -> tuple[list[Any], bool]:
@@ -222,11 +221,6 @@ def _opened(path: Path, is_ros1: bool, stack: ExitStack, notes: list[str], salva
     return reader
 
 
-def _decoder(store: Any, is_ros1: bool) -> Callable[[bytes, str], Any]:
-    read: Callable[[bytes, str], Any] = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-    return read
-
-
 SUFFIXES = {MAGIC: ".mcap", SQLITE_MAGIC: ".db3", ROS1_MAGIC: ".bag"}
 """How the name of a bag's file ends, by its first bytes."""
 
@@ -249,7 +243,7 @@ def _check_file(path: Path) -> bool:
 def _check_folder(path: Path) -> None:
     """Refuse what the library would wait for or fill a disk with."""
     content = read_bytes(path / METADATA, BAG_METADATA)[0] if (path / METADATA).exists() else b""
-    is_file_compressed = b"compression_mode: FILE" in content.upper().replace(b"COMPRESSION_MODE", b"compression_mode")
+    is_file_compressed = b"COMPRESSION_MODE: FILE" in content.upper()
     for one in sorted(path.iterdir()):
         if one.is_dir():
             continue

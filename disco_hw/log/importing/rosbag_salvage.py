@@ -21,6 +21,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from disco_hw.files import LOG, open_file
+from disco_hw.log.container import McapCopy
 
 # Chosen: as of our own logs (`disco_hw.log.container`): a larger record is damage.
 _LARGEST_RECORD_BYTES = 256 * 1024 * 1024
@@ -48,30 +49,21 @@ def salvage(path: Path, folder: Path) -> tuple[Path, str] | None:
 
 def _copy_mcap(path: Path, target: Path) -> str:
     """Copy the messages of an MCAP; returns how much could be read, empty if there is no message."""
-    schemas: dict[int, int] = {}
-    channels: dict[int, int] = {}
     messages = damaged = 0
     with os.fdopen(open_file(path, LOG), "rb") as source, target.open("wb") as sink:
         writer = Writer(sink, compression=CompressionType.NONE)
         writer.start(profile="ros2")
+        copy = McapCopy(writer)
         # Where the damage begins nothing can be read any more.
         with contextlib.suppress(Exception):
             for record in _records(source):
-                if record is None:
-                    damaged += 1
-                elif isinstance(record, Schema) and record.id not in schemas:
-                    schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-                elif isinstance(record, Channel) and record.id not in channels:
-                    schema = schemas.get(record.schema_id, 0)
-                    channels[record.id] = writer.register_channel(
-                        record.topic, record.message_encoding, schema, record.metadata
-                    )
-                elif isinstance(record, Message) and record.channel_id in channels:
-                    messages += 1
-                    if len(record.data) <= _LARGEST_MESSAGE_BYTES:
-                        writer.add_message(
-                            channels[record.channel_id], record.log_time, record.data, record.publish_time
-                        )
+                match record:
+                    case None:
+                        damaged += 1
+                    case Schema() | Channel():
+                        copy.describe(record)
+                    case Message():
+                        messages += len(record.data) > _LARGEST_MESSAGE_BYTES or copy.add(record)
         writer.finish()  # type: ignore[no-untyped-call]  # The library does not annotate it.
     return _extent(messages, damaged)
 
@@ -90,15 +82,13 @@ def _records(source: BinaryIO) -> Iterator[Any]:  # Any: the library's records, 
             readable = source.tell()
             if not isinstance(record, Chunk):
                 yield record
-            elif record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
-                try:
+                continue
+            inside: list[Any] = [None]
+            # Whatever the decompressors raise of damaged bytes: counted, and said.
+            with contextlib.suppress(Exception):
+                if record.uncompressed_size <= _LARGEST_UNPACKED_BYTES:
                     inside = breakup_chunk(record, validate_crc=True)
-                except Exception:  # Whatever the decompressors raise of damaged bytes: counted, and said.
-                    yield None
-                    continue
-                yield from inside
-            else:
-                yield None
+            yield from inside
     source.seek(readable)
     rest = source.read(_LARGEST_RECORD_BYTES)
     # What is whole of a last chunk that was cut: a short recording may have no other.

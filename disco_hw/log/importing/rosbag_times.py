@@ -6,13 +6,14 @@ one time, that the robot's clock was set, concerns all of them.
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.log.drive import Index
+from disco_hw.log.drive import Array, Index
 from disco_hw.log.importing.losses import WARNING
 
 Mask = NDArray[np.bool_]
@@ -46,6 +47,41 @@ class Stamps:
     log_ns: Index
     stamp_ns: Index
     is_repeat: Mask | None = None
+
+
+@dataclass(slots=True)
+class Column:
+    """Samples collected from one topic, or from one edge of the transforms."""
+
+    width: int
+    log_ns: array[int] = field(default_factory=lambda: array("q"))
+    stamp_ns: array[int] = field(default_factory=lambda: array("q"))
+    values: array[float] = field(default_factory=lambda: array("d"))
+    left_out: int = 0
+
+    def add(self, log_ns: int, stamp_ns: int, row: tuple[float, ...] | None) -> None:
+        """Keep a row, or count that there was none."""
+        if row is None:
+            self.left_out += 1
+            return
+        self.log_ns.append(log_ns)
+        self.stamp_ns.append(stamp_ns)
+        self.values.extend(row)
+
+    def stamps(self) -> Stamps:
+        """Return the times of its rows."""
+        table = self.table()
+        is_repeat = np.concatenate([[False], alike(table[1:], table[:-1])]) if len(table) else np.empty(0, dtype=bool)
+        return Stamps(np.array(self.log_ns, dtype=np.int64), np.array(self.stamp_ns, dtype=np.int64), is_repeat)
+
+    def table(self) -> Array:
+        """Return the column's rows, (N, width)."""
+        return np.array(self.values, dtype=np.float64).reshape(-1, self.width)
+
+
+def alike(one: Array, other: Array) -> NDArray[np.bool_]:
+    """Whether the rows of two tables (N, k) hold the same values."""
+    return np.asarray(((one == other) | (np.isnan(one) & np.isnan(other))).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True)

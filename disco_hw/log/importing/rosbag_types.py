@@ -40,12 +40,18 @@ class Definitions:
     def _define(self, kind: str, definition: Any) -> str:
         """Add a type to the store; returns why that is not possible, or an empty text."""
         from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
+        from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415
 
         if definition.format == MessageDefinitionFormat.NONE:
             return f"its type {kind} is not of ROS and the bag does not define it"
 
         def register() -> None:
-            self._register(kind, definition.data, is_msg=definition.format == MessageDefinitionFormat.MSG)
+            """Parse the definition and make what reads its messages."""
+            is_msg = definition.format == MessageDefinitionFormat.MSG
+            found = get_types_from_msg(definition.data, kind) if is_msg else get_types_from_idl(definition.data)
+            self._store.register({name: fields for name, fields in found.items() if name not in self._store.fielddefs})
+            if kind in self._store.fielddefs:
+                self._store.get_msgdef(kind)
 
         # A regular expression that is at work hears no signal: it is tried where it can be ended.
         used_s = _cpu_time_s(register, self._left_s) if self._left_s > 0.0 else None
@@ -60,16 +66,6 @@ class Definitions:
             reason = " ".join(str(error).split())[:_LONGEST_TEXT].rstrip(".") or type(error).__name__
             return f"the bag's definition of {kind} cannot be read ({reason})"
         return "" if kind in self._store.fielddefs else f"the bag does not define its type {kind}"
-
-    def _register(self, kind: str, text: str, is_msg: bool) -> None:
-        """Parse a definition and make what reads its messages."""
-        from rosbags.typesys import get_types_from_idl, get_types_from_msg  # noqa: PLC0415
-
-        found = get_types_from_msg(text, kind) if is_msg else get_types_from_idl(text)
-        store = self._store
-        store.register({name: fields for name, fields in found.items() if name not in store.fielddefs})
-        if kind in store.fielddefs:
-            store.get_msgdef(kind)
 
 
 def _cpu_time_s(work: Callable[[], None], limit_s: float) -> float | None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log.importing.counter_wrap import restarts, unwrap_counter, unwrap_wheels
+from disco_hw.log.importing.counter_wrap import continuous_wheels, restarts, unwrap_counter
 from disco_hw.log.importing.csv_drive import read_csv
 
 DT_S = 0.05
@@ -53,9 +53,11 @@ def test_a_pause_in_which_a_counter_may_wrap_unseen_begins_a_segment(tmp_path):
 def test_a_wheel_that_wraps_too_rarely_takes_the_span_of_the_other():
     counts = np.column_stack([np.floor(90.0 * np.arange(400)), np.floor(25.0 * np.arange(400))])
     no_restarts, unknown = np.zeros(T_S.size, dtype=bool), np.full((T_S.size, 2), np.nan)
-    left, right = unwrap_wheels(T_S, counts % 6000.0, (), no_restarts, unknown)
-    assert (left.span, right.span, right.wraps) == (6000.0, 6000.0, 1)
-    np.testing.assert_array_equal(right.values, counts[:, 1])
+    notes = []
+    values, _ = continuous_wheels(("left", "right"), T_S, counts % 6000.0, (), no_restarts, unknown, notes)
+    assert notes[0].startswith("left wraps at 6000 counts: ")
+    assert notes[1:] == ["right wraps at 6000 counts: made continuous at 1 places"]
+    np.testing.assert_array_equal(values, counts)
 
 
 def test_a_step_from_one_segment_to_the_next_is_no_wrap():
@@ -64,7 +66,7 @@ def test_a_step_from_one_segment_to_the_next_is_no_wrap():
     begins[300] = True
     values = counts % 4096.0
     values[300:] = counts[300:] - counts[300]
-    found = unwrap_counter(T_S, values, begins=begins)
+    found = unwrap_counter(T_S, values, (), begins, np.full(T_S.size, np.nan))
     assert (found.span, found.wraps) == (4096.0, 1)
     steps = np.delete(np.diff(found.values), 299)
     np.testing.assert_array_equal(steps, 20.0)

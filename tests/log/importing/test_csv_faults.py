@@ -221,7 +221,7 @@ def test_ticks_that_wrap_are_made_continuous_wheel_by_wheel(tmp_path, span, both
     np.testing.assert_allclose(drive.wheels.right_angle_rad, reference.wheels.right_angle_rad, atol=1e-9)
     assert drive.segments == 1
     assert len(drive.notes) == 1 + both
-    assert f"enc_left_ticks wraps at {span}: made continuous at" in drive.notes[0]
+    assert f"enc_left_ticks wraps at {span} counts: made continuous at" in drive.notes[0]
 
 
 def test_an_encoder_that_is_set_anew_begins_a_new_segment(tmp_path):

@@ -211,7 +211,7 @@ def test_positions_within_one_turn_are_made_continuous(tmp_path):
     assert drive.wheels.left_angle_rad[-1] == pytest.approx(19.9)
     np.testing.assert_allclose(drive.wheels.left_speed_rad_s[1:], 5.0, atol=1e-3)
     assert not drive.wheels.speed_measured
-    assert has_note(drive, "left wheel: the position wraps at 6.283185307 rad: made continuous at 3 places")
+    assert has_note(drive, "left wheel wraps at 6.283185307 rad: made continuous at 3 places")
 
 
 @pytest.mark.parametrize(
@@ -258,3 +258,12 @@ def test_no_topics_are_taken_for_what_has_none(robot, tmp_path):
 def test_a_topic_that_is_no_role_and_name_is_refused(robot, tmp_path, made, topic):
     with pytest.raises(Exception, match="is not ROLE=NAME"):
         import_log(made[0], robot, tmp_path / "log.mcap", [topic])
+
+
+@pytest.mark.parametrize(("role", "hint"), [("wheels", "set ros2.left_joints"), ("commands", "name another")])
+def test_joints_that_are_no_wheels_are_refused_as_a_named_topic(tmp_path, role, hint):
+    with bag(place(tmp_path)) as maker:
+        for k in range(20):
+            maker.write("/arm", maker.joints(time_ns(k), ("elbow", "wrist"), [0.1 * k, 0.2], [0.1, 0.2]), time_ns(k))
+    with pytest.raises(LogError, match=hint):
+        read_rosbag(place(tmp_path), config(**{f"{role.removesuffix('s')}_topic": "/arm"}))
