@@ -354,10 +354,7 @@ def _is_steady(mean: Array, difference: Array) -> bool:
 
 
 def undetermined(draws: Array, low: Array, high: Array, drive: Excitation, paper: bool) -> list[str]:
-    """Sentences on what stays open, the widest first; empty if the log determines all.
-
-    `draws` (n, 3) of the posterior, `low`, `high` (3,) of the prior, in the order of `NAMES`.
-    """
+    """Sentences on what `draws` (n, 3) in the order of `NAMES` leave open within the prior (3,), the widest first."""
     found = [*_wide_directions(draws, low, high, drive)]
     if paper:
         found.append(PAPER)

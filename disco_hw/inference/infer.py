@@ -34,7 +34,7 @@ from disco_hw.inference.density_network import (
     RoundSettings,
     run_rounds,
 )
-from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
+from disco_hw.inference.estimates import CrossCorrelation, PaperStatistics, estimates
 from disco_hw.inference.excitation import Excitation, excitation
 from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.simulate import (
@@ -163,7 +163,8 @@ def _infer(
     _check_inside(prior, plain, known.fit_std)
     summary: Summary = estimates(drive, noise)
     if options.paper:
-        summary = cross_correlation(drive) if options.cross_correlation else paper_statistics(drive)
+        crossed = CrossCorrelation(drive.starts, drive.roll_rad)
+        summary = crossed if options.cross_correlation else PaperStatistics(drive.starts)
     simulator = Simulator(nominal, drive, noise, known.factor)
     observed = summary(drive.pose[None])[0]
     widened = 0 if options.paper else WIDENING_SIMULATIONS

@@ -5,7 +5,7 @@ Both are found from what a geometry leaves unexplained of the path, over windows
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -60,21 +60,9 @@ class Noise:
     lever_m: float = 0.0
     speed_share: float = 0.0
 
-    def vector(self) -> Array:
-        """Return the five standard deviations in order, (5,)."""
-        return np.array(
-            [
-                self.position_m,
-                self.yaw_rad,
-                self.slip_forward_m_sqrt_s,
-                self.slip_left_m_sqrt_s,
-                self.slip_yaw_rad_sqrt_s,
-            ]
-        )
-
     def scales(self) -> Array:
         """Return the five standard deviations, the correlation time and the lever, (7,)."""
-        return np.append(self.vector(), [self.correlation_s, self.lever_m])
+        return np.array(astuple(self)[:-1])
 
     def about_the_point(self) -> Noise:
         """Return noise of the same variances without a lever."""
@@ -86,10 +74,7 @@ USUAL = Noise(0.005, 0.01, 0.005, 0.005, 0.015)
 
 
 def slip_intensity(drive: Excitation, speed_share: float) -> tuple[Array, Array]:
-    """Return the growth (s) of the slip's variance, relative to its mean while moving.
-
-    At each node (M,), and up to each pose from the one before (P,).
-    """
+    """Growth (s) of slip's variance over its mean in motion: at nodes (M,), and up to each pose from the last (P,)."""
     window = np.ones(2 * MOVING_SPREAD_STEPS + 1) / (2 * MOVING_SPREAD_STEPS + 1)
     square = np.convolve((drive.wheel_rad_s**2).mean(axis=1), window, mode="same")
     usual = float(square @ drive.moving) / max(float(drive.moving.sum()), 1.0)
