@@ -99,10 +99,7 @@ def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
 
 
 def _pull(logs: Array, start: Array, prior_sd: float) -> float:
-    """Return the cost (nats) of a weak Gaussian prior on logarithms of parameters, centred at `start`.
-
-    The prior keeps parameters that the log says nothing about where they are.
-    """
+    """Cost (nats) of a weak Gaussian prior about `start`: logarithms stay of which the log says nothing."""
     return 0.5 * float((((logs - start) / prior_sd) ** 2).sum())
 
 
@@ -164,7 +161,7 @@ def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
     if 0 < wild.sum() < 0.02 * wild.size:
         channel = channel.with_noise(channel.noise, ~wild)
         white = whiten_wheels(raw, channel.gains)
-    return channel.weighted(local_weight(white, channel.gains.use, channel.settings.noise))
+    return replace(channel, weight=local_weight(white, channel.gains.use, channel.settings.noise))
 
 
 def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyChannel:
@@ -173,7 +170,7 @@ def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None,
     channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p, extra)
     channel = channel.with_noise(fit_body_noise(channel, p, extra, iterations))
     channel = without_outliers(channel, p, extra)
-    return channel.weighted(local_weight(channel.whitened(p, extra), channel.use, channel.settings.noise))
+    return replace(channel, weight=local_weight(channel.whitened(p, extra), channel.use, channel.settings.noise))
 
 
 @dataclass(frozen=True, slots=True)

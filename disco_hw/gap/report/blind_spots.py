@@ -18,10 +18,10 @@ from multiprocessing.process import BaseProcess
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Effect, Parameter
+from disco_hw.effects import Effect
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BASE_COUNT, BODY, pose_sensor
-from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.data.free_runs import read_angles, rotated
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.data.timing import pose_delay_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
@@ -78,21 +78,17 @@ def _spot(found: ChannelResult, name: str) -> BlindSpot:
     return BlindSpot(name, parameter.name, parameter.unit, size, is_blind(name, size), experiment_of(name))
 
 
-def is_blind(name: str, size: float | None) -> bool:
-    """Whether realistic sizes stay hidden where this is the smallest visible one; of a limit, the largest."""
-    effect = REGISTRY[name]
-    realistic = _realistic(next((p for p in effect.parameters if p.realistic is not None), effect.parameters[0]))
-    if effect.is_limit:
-        return size is None or (size < realistic < math.inf)
-    return size is None or size > realistic
+def is_blind(name: str, size: float | None, possible: float = math.inf) -> bool:
+    """Whether realistic sizes stay hidden where this is the smallest visible one; of a limit, the largest.
 
-
-def _realistic(parameter: Parameter) -> float:
-    """Return the size of a parameter that real robots show; infinity if none is known.
-
-    A log is blind to an effect that is visible above that size only, or to a limit that is visible below it only.
+    A log is blind to an effect that is visible only above the size that real robots show. It is blind to a limit that
+    is visible only below that size and below what is `possible` for the robot.
     """
-    return math.inf if parameter.realistic is None else parameter.realistic
+    effect = REGISTRY[name]
+    realistic = next((p.realistic for p in effect.parameters if p.realistic is not None), math.inf)
+    if effect.is_limit:
+        return size is None or (size < min(realistic, possible) < math.inf)
+    return size is None or size > realistic
 
 
 def experiment_of(name: str) -> str:
@@ -113,8 +109,7 @@ def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpo
             possible = channel.settings.report.limit_share * float(
                 effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0]
             )
-    enough = min(possible, _realistic(parameter))
-    blind = largest is None or (largest < enough < math.inf)
+    blind = is_blind(name, largest, possible)
     return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
 
 
@@ -130,10 +125,7 @@ def _largest(
 
 
 def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
-    """Return the largest of a limit's trial values that this log would have shown, or None.
-
-    Parameters of the fit and the delays of the wheels may adapt, as they may hide the limit.
-    """
+    """Largest of a limit's trial values that this log shows though other parameters and delays adapt; None if none."""
     channel, best = found.selector.channel, found.fit
     layout, limits = channel.layout, found.selector.thresholds
     places = tuple(
@@ -214,10 +206,7 @@ _BOLDEST = 10.0
 
 
 def boldest_claims(spots: Iterable[BlindSpot], most: int) -> tuple[BlindSpot, ...]:
-    """Return the claims, `most` at most, whose visible sizes are furthest below those that real robots show.
-
-    Effects that equal another one algebraically are left out.
-    """
+    """Return the `most` claims furthest below what real robots show, but for effects that equal another by algebra."""
     claims = [spot for spot in spots if spot.smallest_visible is not None and not spot.blind and _boldness(spot)]
     claims = [spot for spot in claims if REGISTRY[spot.name].mimics is None]
     return tuple(sorted(claims, key=_boldness, reverse=True)[:most])
@@ -396,11 +385,11 @@ def _moved(
     old, new = pose_sensor(now[0]), pose_sensor(then[0])
     measured = drive.pose_values
     turned = after[:, 2] - before[:, 2]
-    step = _rotated(np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2]), _earlier(turned))
+    step = rotated(np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2]), _earlier(turned))
     residual = [
-        _rotated(np.diff(path[:, :2], axis=0, prepend=path[:1, :2]), -_earlier(path[:, 2])) for path in (before, after)
+        rotated(np.diff(path[:, :2], axis=0, prepend=path[:1, :2]), -_earlier(path[:, 2])) for path in (before, after)
     ]
-    step += _rotated(residual[1] - residual[0], _earlier(measured[:, 2] - old.bias_rad + turned))
+    step += rotated(residual[1] - residual[0], _earlier(measured[:, 2] - old.bias_rad + turned))
     # A drift of the world's has its directions, not the robot's.
     ground = channel.carried(then[0]) - channel.carried(now[0])
     seen = np.column_stack([np.interp(drive.pose.t_s, drive.t_s, ground[:, axis]) for axis in (0, 1)])
@@ -426,8 +415,3 @@ def _path(drive: GriddedDrive, channel: BodyChannel, vector: Array, extra: Array
 def _earlier(values: Array) -> Array:
     """Return the predecessor of each value; the first value is its own predecessor."""
     return np.concatenate([values[:1], values[:-1]])
-
-
-def _rotated(step: Array, angle: Array) -> Array:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.column_stack([cosine * step[:, 0] - sine * step[:, 1], sine * step[:, 0] + cosine * step[:, 1]])
