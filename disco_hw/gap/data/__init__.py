@@ -127,10 +127,7 @@ ENCODER_COLUMNS = tuple(column for effect in _ENCODERS for column in effect.colu
 _POSE_TIME, _POSE, _WORLD = in_stages(Stage.POSE_TIME), in_stages(Stage.POSE), in_stages(Stage.WORLD)
 _ARGUMENTS = {effect.name: arguments_of(effect.plain) for effect in (*_ENCODERS, *_POSE_TIME, *_POSE, *_WORLD)}
 _SENSED = np.array(
-    [
-        *range(BASE_COUNT),
-        *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE) for column in effect.columns),
-    ]
+    [*range(BASE_COUNT), *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE) for column in effect.columns)]
 )
 
 
@@ -194,11 +191,7 @@ def counted(layout: Layout, p: Array) -> tuple[float, float]:
 
 def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) -> Any:
     """Evaluate an effect's plain equation for the motion of one second, with the parameters of a vector."""
-    known: dict[str, Any] = {
-        "values": tuple(p[layout.spans[effect.name]].tolist()),
-        "step_s": 1.0,
-        **motion,
-    }
+    known: dict[str, Any] = {"values": tuple(p[layout.spans[effect.name]].tolist()), "step_s": 1.0, **motion}
     known["geometry"] = tuple(p[:BASE_COUNT].tolist())
     return effect.plain(**{name: known[name] for name in _ARGUMENTS[effect.name]})
 

@@ -81,15 +81,7 @@ def _turned(cosine: float, sine: float, half: float) -> tuple[float, float]:
 
 @kernel_function
 def _run_body(
-    base: Any,
-    effects: Any,
-    scale: Any,
-    angle: Array,
-    speed: Array,
-    extra: Array,
-    first: Mask,
-    t_s: Array,
-    track: Array,
+    base: Any, effects: Any, scale: Any, angle: Array, speed: Array, extra: Array, first: Mask, t_s: Array, track: Array
 ) -> None:
     x = y = yaw = 0.0
     c, s = 1.0, 0.0

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,10 +126,10 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
     grid_settings = settings.grid
     wheels = undo_sample_hold(log.wheels, grid_settings)
-    timed = _timed(log, wheels, grid_settings)
+    timed_commands, timed_poses, commands_moved_s, timing_notes = _timed(log, wheels, grid_settings)
     ticks_s = {"commands": tick_s(log.commands.t_s, log.wheels.t_s), "poses": tick_s(log.poses.t_s, log.wheels.t_s)}
     scatter_s = {whose: each_s / 12.0**0.5 for whose, each_s in ticks_s.items()}
-    command_samples, poses, notes = timed.commands.samples, timed.poses.samples, [*timed.notes]
+    command_samples, poses, notes = timed_commands.samples, timed_poses.samples, [*timing_notes]
     notes += [
         f"{whose} are stamped by the rows of the log, {1e3 * ticks_s[whose]:.0f} ms apart: how late they are is known "
         f"to {2e3 * each_s:.0f} ms at best"
@@ -200,27 +199,21 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
         settings=settings,
-        pose_delay_s=timed.poses.delay_s,
-        pose_clock_even=timed.poses.even,
-        commands_moved_s=timed.commands_moved_s,
-        commands_timed=timed.commands.known,
-        poses_moved_s=timed.poses.delay_s,
-        command_stamps_s=math.hypot(scatter_s["commands"], timed.commands.apart_s),
-        pose_stamps_s=math.hypot(scatter_s["poses"], timed.poses.apart_s),
+        pose_delay_s=timed_poses.delay_s,
+        pose_clock_even=timed_poses.even,
+        commands_moved_s=commands_moved_s,
+        commands_timed=timed_commands.known,
+        poses_moved_s=timed_poses.delay_s,
+        command_stamps_s=math.hypot(scatter_s["commands"], timed_commands.apart_s),
+        pose_stamps_s=math.hypot(scatter_s["poses"], timed_poses.apart_s),
         log_begins_s=log.begins_s,
     )
 
 
-class _Timed(NamedTuple):
-    """Commands and poses where they belong beside the wheels at first sight, and by how much they were moved."""
-
-    commands: Aligned[Commands]
-    poses: Aligned[Poses]
-    commands_moved_s: float
-    notes: tuple[str, ...]
-
-
-def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
+def _timed(
+    log: DriveLog, wheels: Wheels, settings: GridSettings
+) -> tuple[Aligned[Commands], Aligned[Poses], float, tuple[str, ...]]:
+    """Commands and poses where they belong beside the wheels at first sight, by how much (s) commands moved; notes."""
     poses = aligned(
         wheels, log.poses, log.begins_s, lambda wheels, some: (pose_clock(wheels, some, settings), True),
         settings.least_clock_error_s, "poses'",
@@ -240,7 +233,7 @@ def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
     later_s = _to_borders(commands.samples, float(wheels.t_s[0]), -commands.delay_s) if wheels.t_s.size else 0.0
     asked = replace(commands.samples, t_s=_moved(commands.samples.t_s, later_s))
     seen = replace(poses.samples, t_s=_moved(poses.samples.t_s, -poses.delay_s))
-    return _Timed(replace(commands, samples=asked), replace(poses, samples=seen), later_s, notes)
+    return replace(commands, samples=asked), replace(poses, samples=seen), later_s, notes
 
 
 def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:

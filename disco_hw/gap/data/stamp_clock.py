@@ -265,10 +265,5 @@ def aligned(
             f" if it were {middle_s:.3g} s in all; synchronise the clocks"
         )
     return Aligned(
-        joined(parts),
-        middle_s,
-        True,
-        not uneven,
-        float(np.std(delays, ddof=1)) if apart else 0.0,
-        tuple(notes),
+        joined(parts), middle_s, True, not uneven, float(np.std(delays, ddof=1)) if apart else 0.0, tuple(notes)
     )

@@ -17,14 +17,7 @@ from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, ru
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
 from disco_hw.gap.data.stamp_clock import picked
 from disco_hw.gap.noise.body_noise import BodyGains, BodyMotion, BodyNoise, body_gains, whiten_body
-from disco_hw.gap.noise.wheel_noise import (
-    WheelGains,
-    WheelMotion,
-    WheelNoise,
-    mean_speeds,
-    wheel_gains,
-    whiten_wheels,
-)
+from disco_hw.gap.noise.wheel_noise import WheelGains, WheelMotion, WheelNoise, mean_speeds, wheel_gains, whiten_wheels
 from disco_hw.gap.settings import GapSettings
 
 Array = NDArray[np.float64]
@@ -67,7 +60,7 @@ class WheelChannel:
         return p, None
 
     @classmethod
-    def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
+    def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array) -> WheelChannel:
         """Build the channel with a noise model; samples without a known command are not used.
 
         `geometry` (3,): wheel radius, axial distance, x_icr, for effects that speak of the robot's motion.
@@ -76,7 +69,6 @@ class WheelChannel:
         known = np.isfinite(drive.command_rad_s[:, 0])
         # One known cell before is not enough: the run begins anew after unknown commands.
         followed = known[place.node] & known[np.maximum(place.node - 1, 0)]
-        good = followed if use is None else followed & use
         dt = np.diff(place.t_s, prepend=place.t_s[0])
         first_of_run = np.zeros(place.t_s.size, dtype=bool)
         starts = np.flatnonzero(drive.first)
@@ -91,7 +83,7 @@ class WheelChannel:
         # gain.
         calm = mean_speeds(dt, speed, settings.calm_s)
         steady = mean_speeds(dt, speed, settings.steady_s, settings.fewest_steady)
-        motion = WheelMotion(dt, calm, steady, np.maximum(between, 0.0), first_of_run | resumed, good)
+        motion = WheelMotion(dt, calm, steady, np.maximum(between, 0.0), first_of_run | resumed, followed)
         return cls(drive, motion, wheel_gains(noise, motion), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
@@ -240,7 +232,7 @@ class BodyChannel:
         channel = cls(drive, samples, measured, window, starts[run], ends[run], chosen, gains, nothing, noise, geometry)
         return channel.with_noise(noise)
 
-    def motion(self, rim_m_s: Array) -> BodyMotion:
+    def motion(self) -> BodyMotion:
         """Return the robot's motion between the pose samples, from the wheels and the rough geometry."""
         drive, samples, p = self.drive, self.samples, self.geometry
         speeds = drive.speed_rad_s[samples.node]
@@ -252,21 +244,15 @@ class BodyChannel:
         step[restart] = 0.0
         dt = np.diff(samples.t_s, prepend=samples.t_s[0])
         dt[restart] = 0.0
-        moving = np.minimum(rim_m_s[samples.node] / self.settings.noise.slip_onset_m_s, 1.0)
+        rim_m_s = np.abs(speeds).max(axis=1) * p[0]
+        moving = np.minimum(rim_m_s / self.settings.noise.slip_onset_m_s, 1.0)
         return BodyMotion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
 
-    def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
+    def with_noise(self, noise: BodyNoise, use: Mask | None = None) -> BodyChannel:
         """Return the channel with another noise model and weights of 1; `use` is over this channel's samples."""
-        changed = replace(
-            self,
-            noise=noise,
-            geometry=self.geometry if geometry is None else geometry,
-            use=self.use if use is None else use,
-        )
-        rim = np.abs(self.drive.speed_rad_s).max(axis=1) * changed.geometry[0]
-        return replace(
-            changed, gains=body_gains(noise, changed.motion(rim)), weight=np.ones((self.samples.t_s.size, 3))
-        )
+        changed = replace(self, noise=noise, use=self.use if use is None else use)
+        gains, weight = body_gains(noise, changed.motion()), np.ones((self.samples.t_s.size, 3))
+        return replace(changed, gains=gains, weight=weight)
 
     @property
     def neutral(self) -> Array:

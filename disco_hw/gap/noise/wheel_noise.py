@@ -168,14 +168,7 @@ def _likelihood(
 
 @kernel_function
 def _whiten(
-    residual: Array,
-    decay: Array,
-    reach: Array,
-    gain: Array,
-    scale: Array,
-    restart: Array,
-    use: Array,
-    out: Array,
+    residual: Array, decay: Array, reach: Array, gain: Array, scale: Array, restart: Array, use: Array, out: Array
 ) -> None:
     # Both wheels in one loop: each one's filter waits for itself, and neither for the other.
     drift = fast = slow = other_drift = other_fast = other_slow = 0.0

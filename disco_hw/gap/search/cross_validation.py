@@ -264,11 +264,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
 
 
 def errors_of(
-    body: BodyChannel,
-    wheels: WheelChannel | None,
-    chains: dict[int, Chain],
-    ahead_s: float,
-    poses: tuple[Array, Array],
+    body: BodyChannel, wheels: WheelChannel | None, chains: dict[int, Chain], ahead_s: float, poses: tuple[Array, Array]
 ) -> PredictionErrors:
     """Errors at one horizon, each start predicted by the chain of its fold."""
     starts = find_starts(body, poses, ahead_s)

@@ -143,25 +143,22 @@ def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
 def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, delay_s: float) -> GriddedDrive:
     """Return the drive with what the terms among `effects` add; `p` is the parameter vector of the body."""
     u, (v, w, a) = drive.delayed_commands(delay_s), motion(drive, p)
-    command = motion_perturbation = None
+    of_commands: list[Array] = []
+    of_motion: list[Array] = []
     for setting in effects:
         term = TERMS.get(setting.name)
         if term is None:
             continue
-        if term.target == COMMAND:
-            perturbation = _times(setting, _of_commands(term, u, drive.t_s))
-            command = perturbation if command is None else command + perturbation
+        is_of_commands = term.target == COMMAND
+        feature = _of_commands(term, u, drive.t_s) if is_of_commands else _of_body(term, v, w, a, drive.t_s)
+        reach = setting.values[REACH.name]
+        added = setting.values["k"] * np.clip(feature, -reach, reach)
+        if is_of_commands:
+            of_commands.append(added)
         else:
-            perturbation = _times(setting, _of_body(term, v, w, a, drive.t_s))
-            perturbation = _on(BODY_TARGETS.index(term.target), perturbation)
-            motion_perturbation = perturbation if motion_perturbation is None else motion_perturbation + perturbation
-    return replace(drive, known_command=command, known_motion=motion_perturbation)
-
-
-def _times(setting: EffectSetting, feature: Array) -> Array:
-    """Return the contribution of a model's term for a feature at the nodes."""
-    reach = setting.values[REACH.name]
-    return np.asarray(setting.values["k"] * np.clip(feature, -reach, reach))
+            of_motion.append(_on(BODY_TARGETS.index(term.target), added))
+    command, moved = (sum(each[1:], each[0]) if each else None for each in (of_commands, of_motion))
+    return replace(drive, known_command=command, known_motion=moved)
 
 
 def _of_commands(term: GenericTerm, u: Array, t_s: Array) -> Array:
