@@ -9,7 +9,6 @@ small.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,7 +102,6 @@ class Inference:
     noise: Noise
     simulator: Simulator
     summary: Summary
-    prior: Region
     observed: Array
     fitted: Fitted
     draws: Array
@@ -114,7 +112,6 @@ class Inference:
     calibration: Calibration
     effective_simulations: float
     undetermined: tuple[str, ...]
-    seconds: float
 
     def model(self, nominal: Model) -> Model:
         """Return the nominal model with the posterior's mean and the posterior as belief."""
@@ -129,7 +126,7 @@ def infer(
     report_progress: ReportProgress = lambda *_: None,
     workers: Workers | None = None,
 ) -> Inference:
-    """Infer x_icr, wheel radius and axial distance from a drive; pure for a given seed, but for the time it takes.
+    """Infer x_icr, wheel radius and axial distance from a drive; pure for a given seed.
 
     `workers` run simulations and fits, by default on all cores; the result is the same. `report_progress` gets stage
     and share done. Raises InputError for a drive or options from which nothing can be inferred.
@@ -147,7 +144,6 @@ def infer(
 def _infer(
     log: DriveLog, robot: RobotConfig, options: InferOptions, report_progress: ReportProgress, workers: Workers | None
 ) -> Inference:
-    began = perf_counter()
     simulations = options.simulations or (PAPER_SIMULATIONS if options.paper else DEFAULT_SIMULATIONS)
     if not options.paper and (options.random_features or options.cross_correlation):
         raise InputError("--random-features and --cross-correlation belong to the paper's method: give --paper too")
@@ -196,7 +192,6 @@ def _infer(
         noise,
         simulator,
         summary,
-        prior,
         observed,
         fitted,
         draws[0],
@@ -207,7 +202,6 @@ def _infer(
         calibration,
         effective_simulations(fitted, observed),
         tuple(undetermined(draws[0], prior.low, prior.high, drive, options.paper)),
-        perf_counter() - began,
     )
 
 

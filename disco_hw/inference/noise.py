@@ -116,10 +116,7 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
     for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
         windows = _windows(drive, error, turned, by_speed_s, lag)
         length_s = lag * period_s
-        for moves, chosen in (
-            (False, windows.moving_s < 0.05 * length_s),
-            (True, windows.moving_s > 0.9 * length_s),
-        ):
+        for moves, chosen in ((False, windows.moving_s < 0.05 * length_s), (True, windows.moving_s > 0.9 * length_s)):
             if np.count_nonzero(chosen) >= _FEWEST_WINDOWS:
                 part = _chosen(windows, chosen, 0.5 if lag > 1 else 1.0)
                 rows.append(part)
@@ -142,14 +139,9 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
 
 
 def _chosen(windows: _Windows, chosen: NDArray[np.bool_], independent: float) -> _Windows:
-    return _Windows(
-        windows.error[chosen],
-        windows.moving_s[chosen],
-        windows.intensity[chosen],
-        windows.growth,
-        windows.sensor[chosen],
-        independent * np.count_nonzero(chosen),
-    )
+    count = independent * np.count_nonzero(chosen)
+    error, moving_s, intensity = windows.error[chosen], windows.moving_s[chosen], windows.intensity[chosen]
+    return _Windows(error, moving_s, intensity, windows.growth, windows.sensor[chosen], count)
 
 
 def _variance(squares: Array) -> Array:
