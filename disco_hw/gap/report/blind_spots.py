@@ -127,20 +127,32 @@ def _largest(
 def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
     """Largest of a limit's trial values that this log shows though other parameters and delays adapt; None if none."""
     channel, best = found.selector.channel, found.fit
-    layout, limits = channel.layout, found.selector.thresholds
+    layout = channel.layout
     places = tuple(
         layout.place[name] for name in DELAY_COLUMNS if name in layout.place and layout.place[name] not in best.active
     )
     slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, places, best.residual)])
+    threshold = found.selector.thresholds.score + math.log(max(channel.count, 2))
+    return _first_shown(found, effect.columns[0], effect.trials, threshold, slope)
+
+
+def _first_shown(
+    found: ChannelResult, column: str, trials: Iterable[float], threshold: float, slope: Array | None = None
+) -> float | None:
+    """First of the trial values whose prediction differs from the one without clearly, and enough to matter.
+
+    `slope` (n, k): derivatives with respect to what may adapt meanwhile.
+    """
+    channel, best = found.selector.channel, found.fit
     vector = best.vector.copy()
-    for limit in effect.trials:
-        vector[layout.place[effect.columns[0]]] = limit
+    for value in trials:
+        vector[channel.layout.place[column]] = value
         moved = channel.residual(vector) - best.residual
-        residual = moved - slope @ solve(slope, slope.T @ moved)
-        enough = (limits.score + math.log(max(channel.count, 2))) * channel.settings.noise.poor_fit
-        ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
-        if float(residual @ residual) > enough and ahead_m > limits.moves_m:
-            return limit
+        left = moved if slope is None else moved - slope @ solve(slope, slope.T @ moved)
+        if float(left @ left) <= threshold * channel.settings.noise.poor_fit:
+            continue
+        if found.selector.moves(channel.split(best.vector), channel.split(vector)) > found.selector.thresholds.moves_m:
+            return value
     return None
 
 
@@ -153,7 +165,7 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     layout, candidate, limits = channel.layout, CANDIDATES[name], found.selector.thresholds
     threshold = limits.score + candidate.parameters * math.log(max(channel.count, 2))
     if candidate.profile is not None and column == candidate.profile.column:
-        return _by_trial(found, column, REGISTRY[name].trials, threshold)
+        return _first_shown(found, column, REGISTRY[name].trials, threshold)
     vector = best.vector.copy()
     if candidate.profile is not None:
         values = candidate.profile.values(channel)
@@ -179,23 +191,6 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     if moved < limits.moves_m:
         size = size * limits.moves_m / moved if moved > 0.0 else math.inf
     return size if size < limit else None
-
-
-def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], threshold: float) -> float | None:
-    """Smallest of a row of sizes whose prediction differs from the one without clearly, and enough to matter."""
-    channel, best = found.selector.channel, found.fit
-    place = channel.layout.place[column]
-    for size in trials:
-        vector = best.vector.copy()
-        vector[place] = size
-        difference = channel.residual(vector) - best.residual
-        enough = found.selector.moves(channel.split(best.vector), channel.split(vector))
-        if (
-            float(difference @ difference) > threshold * channel.settings.noise.poor_fit
-            and enough > found.selector.thresholds.moves_m
-        ):
-            return size
-    return None
 
 
 # Whether a search names an effect that was put into the log at a size.
