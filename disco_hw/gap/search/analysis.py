@@ -6,9 +6,7 @@ without one of the names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,11 +58,6 @@ ENCODER, _SHOWN = next((name, one) for name, one in _MIMICS.items() if one.seen_
 GAIN = _SHOWN.effect.name
 ASYMMETRY = _SHOWN.seen_too_as.EFFECT.name
 ASYMMETRY_COLUMN = REGISTRY[ASYMMETRY].columns[0]
-
-# What decides between the members of a class lies outside such logs.
-OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
-    {frozenset((name, mimicked.effect.name)): mimicked.decided_by for name, mimicked in _MIMICS.items()}
-)
 
 
 def one_encoder(
