@@ -213,7 +213,8 @@ class GeometryFilter:
         self._placed = False
         self._at: WheelSample | None = None
         self._rolled_rad, self._due = 0.0, np.zeros(3)
-        self._innovation_ratio, self._astray = 1.0, 0
+        # Running mean of the squared innovations over their expectation: 1 if all is as believed.
+        self.innovation_ratio, self._astray = 1.0, 0
         self._run, self._run_poses, self._run_innovation_ratio = np.zeros(3), 0, 1.0
 
     @property
@@ -234,12 +235,7 @@ class GeometryFilter:
     @property
     def _variance_scale(self) -> float:
         """Ratio of the innovations' variance to the expected one, of single poses or of sums of them; at least 1."""
-        return max(self._innovation_ratio, self._run_innovation_ratio**2, 1.0)
-
-    @property
-    def innovation_ratio(self) -> float:
-        """Running mean of the squared innovations over their expectation: 1 if all is as believed."""
-        return self._innovation_ratio
+        return max(self.innovation_ratio, self._run_innovation_ratio**2, 1.0)
 
     def add(self, wheels: tuple[WheelSample, ...], poses: tuple[PoseSample, ...]) -> None:
         """Take in what has come; a pose waits until the wheels are known up to its time."""
@@ -316,7 +312,7 @@ class GeometryFilter:
         self._astray = 0
         self.poses += 1
         squares = np.einsum("ni,ni->n", innovations, np.linalg.solve(spreads, innovations[:, :, None])[:, :, 0])
-        self._innovation_ratio += (min(float(squares[0]) / 3.0, 20.0) - self._innovation_ratio) / INNOVATION_POSES
+        self.innovation_ratio += (min(float(squares[0]) / 3.0, 20.0) - self.innovation_ratio) / INNOVATION_POSES
         self._follow_run(innovation, expected)
         surprise = 0.5 * (squares / self._variance_scale + np.linalg.slogdet(spreads)[1])
         won = surprise[0] - surprise

@@ -20,13 +20,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.report import (
-    FleetResult,
-    FleetRow,
-    GapReport,
-    Provenance,
-    reached_horizon_s,
-)
+from disco_hw.gap.report import FleetResult, FleetRow, GapReport, Provenance, reached_horizon_s
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.blind_spots import being_proved, boldest_claims, finder
 from disco_hw.gap.report.events import main_event, rare_events
@@ -253,10 +247,7 @@ def missing_effects(log: DriveLog, model: Model) -> tuple[str, ...]:
 
 
 def search_log(
-    log: DriveLog,
-    model: Model,
-    report_progress: Progress = lambda text: None,
-    settings: GapSettings = DEFAULT_SETTINGS,
+    log: DriveLog, model: Model, report_progress: Progress = lambda text: None, settings: GapSettings = DEFAULT_SETTINGS
 ) -> tuple[GapAnalysis, list[str]]:
     """Search both channels; return notes on what could not be evaluated."""
     drive = grid_drive(log, settings)

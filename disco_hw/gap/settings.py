@@ -72,10 +72,8 @@ class GridSettings:
     """Turns and ways between poses so far apart are compared with the wheels'. Chosen: several poses of a lidar."""
     clock_stretch_s: float = 12.0
     """A drift or jump of the poses' clock is looked for in stretches of this. Chosen: each with starts and turns."""
-    fewest_clock_stretches: int = 4
-    """In fewer of them it is not looked for. Chosen."""
     least_clock_share: float = 0.5
-    """Nor where those that show a delay lie in less of the log. Chosen: a line through them says little of the rest."""
+    """Not where those that show a delay lie in less of the log. Chosen: a line through them says little of the rest."""
     clock_outlier_s: float = 0.1
     """A stretch further off than this counts as so far. Chosen: wheels that begin a circle slowly look late by more."""
     clock_times_better: float = 2.0
@@ -152,8 +150,6 @@ class FitSettings:
     promised_share: float = 0.25
     """Of fits that only compete, a step that gains what was promised within this share takes the derivatives along.
     Chosen: the next step then errs by about its square."""
-    enough_carried_nats: float = 0.002
-    """A step with such derivatives that gains less is the last one. Chosen: they make the last steps shorter."""
     least_known_share: float = 1e-3
     """A part of a log with less of the information about a parameter says nothing of it. Chosen."""
     part_known_share: float = 0.2

@@ -32,11 +32,6 @@ class ScoreTest:
     symptom: Symptom
 
     @property
-    def description(self) -> str:
-        """Description of what the deviation would look like."""
-        return self.symptom.value
-
-    @property
     def effects(self) -> tuple[str, ...]:
         """The effects that leave such a pattern."""
         return tuple(effect.name for effect in REGISTRY.values() if self.symptom in effect.symptoms)
@@ -97,13 +92,7 @@ class Scores:
             body(forward * later, nothing),
         ]
         position = _scores(_both(error, geometry, tested, self.estimates.position))
-        yaw_tested = [
-            forward,
-            turn * np.abs(turn) / dt_s,
-            _change(turn, drive),
-            np.abs(turn),
-            turn * later,
-        ]
+        yaw_tested = [forward, turn * np.abs(turn) / dt_s, _change(turn, drive), np.abs(turn), turn * later]
         columns = np.column_stack([steps[:, 2] - turn, turn, *yaw_tested])
         yaw = _scores((_whitened(columns, self.estimates.yaw), 1))
         return np.concatenate([position, yaw])
@@ -354,10 +343,7 @@ def _is_steady(mean: Array, difference: Array) -> bool:
 
 
 def undetermined(draws: Array, low: Array, high: Array, drive: Excitation, paper: bool) -> list[str]:
-    """Sentences on what stays open, the widest first; empty if the log determines all.
-
-    `draws` (n, 3) of the posterior, `low`, `high` (3,) of the prior, in the order of `NAMES`.
-    """
+    """Sentences on what `draws` (n, 3) in the order of `NAMES` leave open within the prior (3,), the widest first."""
     found = [*_wide_directions(draws, low, high, drive)]
     if paper:
         found.append(PAPER)

@@ -212,13 +212,8 @@ def train(statistics: Array, targets: Array, settings: NetworkSettings, seed: in
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             x, y = torch.as_tensor(features, dtype=torch.float32), torch.as_tensor(targets, dtype=torch.float32)
-            stack = _Stack(
-                x.shape[1],
-                y.shape[1],
-                settings,
-                torch.as_tensor(skip, dtype=torch.float32),
-                torch.as_tensor(residual, dtype=torch.float32),
-            )
+            linear = (torch.as_tensor(each, dtype=torch.float32) for each in (skip, residual))
+            stack = _Stack(x.shape[1], y.shape[1], settings, *linear)
             _fit(stack, x, y, settings)
     finally:
         torch.set_num_threads(threads)
@@ -273,7 +268,6 @@ Simulate = Callable[[Array, Seeds], Array]
 Report = Callable[[str], None]
 
 SCOUT = NetworkSettings(members=2, epochs=60, patience=8)
-FULL = NetworkSettings()
 
 # Chosen: of a posterior, to shrink the region around; and how often draws outside the region are drawn again.
 _DRAWS = 4000
@@ -291,7 +285,7 @@ class RoundSettings:
     shares: tuple[float, ...] = (0.1, 0.1, 0.15, 0.15, 0.5)
     deviations: float = 4.5
     scout: NetworkSettings = SCOUT
-    network: NetworkSettings = FULL
+    network: NetworkSettings = NetworkSettings()
 
 
 @dataclass(frozen=True)
@@ -318,10 +312,7 @@ class Fitted:
         return found.spread(np.asarray(np.linalg.solve(factor, self.widening[:, None] * factor), dtype=np.float64))
 
     def draw(self, statistics: Array, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Draw (n, count, P) samples of the posteriors given statistics (n, S).
-
-        Return with them the share (n,) that had to be drawn again because it fell outside the region.
-        """
+        """Draw samples (n, count, P) given statistics (n, S); with the share (n,) drawn again for being outside."""
         return truncated_draws(self.region, self.posteriors(statistics), count, rng)
 
 

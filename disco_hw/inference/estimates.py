@@ -31,11 +31,7 @@ class Whitening(NamedTuple):
 
 
 def whitening(drive: Excitation, sensor: float, slip: float, grown_s: Array) -> Whitening:
-    """Return the factor that makes increments of poses independent.
-
-    It is for increments with the sensor's standard deviation and the slip per square root of second of its clock,
-    `grown_s` (P,) from pose to pose.
-    """
+    """Factor that whitens increments of sensor noise and of slip per square root of `grown_s` (P,) between poses."""
     variance = 2.0 * sensor**2 + slip**2 * grown_s
     diagonal, carry = np.ones(variance.size), np.zeros(variance.size)
     starts = drive.starts
@@ -146,11 +142,6 @@ class PaperStatistics:
         return np.column_stack([poses[:, :, :2].mean(axis=1), steps.mean(axis=1)])
 
 
-def paper_statistics(drive: Excitation) -> PaperStatistics:
-    """Return the statistics of a drive."""
-    return PaperStatistics(drive.starts)
-
-
 CROSS_CORRELATION = (
     *(f"<d{state}, {wheel}>" for state in ("x", "y", "yaw") for wheel in ("left", "right")),
     *(f"{moment} d{state}" for moment in ("mean", "variance of") for state in ("x", "y", "yaw")),
@@ -177,8 +168,3 @@ class CrossCorrelation:
         wheels = np.column_stack([middle - 0.5 * difference, middle + 0.5 * difference])
         products = np.einsum("nps,pw->nsw", steps, wheels) / wheels.shape[0]
         return np.column_stack([products.reshape(poses.shape[0], -1), steps.mean(axis=1), steps.var(axis=1)])
-
-
-def cross_correlation(drive: Excitation) -> CrossCorrelation:
-    """Return the statistics of a drive."""
-    return CrossCorrelation(drive.starts, drive.roll_rad)

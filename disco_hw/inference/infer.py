@@ -9,7 +9,6 @@ small.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from time import perf_counter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ from disco_hw.inference.density_network import (
     RoundSettings,
     run_rounds,
 )
-from disco_hw.inference.estimates import cross_correlation, estimates, paper_statistics
+from disco_hw.inference.estimates import CrossCorrelation, PaperStatistics, estimates
 from disco_hw.inference.excitation import Excitation, excitation
 from disco_hw.inference.noise import USUAL, Noise, measured_noise
 from disco_hw.inference.simulate import (
@@ -103,7 +102,6 @@ class Inference:
     noise: Noise
     simulator: Simulator
     summary: Summary
-    prior: Region
     observed: Array
     fitted: Fitted
     draws: Array
@@ -114,7 +112,6 @@ class Inference:
     calibration: Calibration
     effective_simulations: float
     undetermined: tuple[str, ...]
-    seconds: float
 
     def model(self, nominal: Model) -> Model:
         """Return the nominal model with the posterior's mean and the posterior as belief."""
@@ -129,7 +126,7 @@ def infer(
     report_progress: ReportProgress = lambda *_: None,
     workers: Workers | None = None,
 ) -> Inference:
-    """Infer x_icr, wheel radius and axial distance from a drive; pure for a given seed, but for the time it takes.
+    """Infer x_icr, wheel radius and axial distance from a drive; pure for a given seed.
 
     `workers` run simulations and fits, by default on all cores; the result is the same. `report_progress` gets stage
     and share done. Raises InputError for a drive or options from which nothing can be inferred.
@@ -147,7 +144,6 @@ def infer(
 def _infer(
     log: DriveLog, robot: RobotConfig, options: InferOptions, report_progress: ReportProgress, workers: Workers | None
 ) -> Inference:
-    began = perf_counter()
     simulations = options.simulations or (PAPER_SIMULATIONS if options.paper else DEFAULT_SIMULATIONS)
     if not options.paper and (options.random_features or options.cross_correlation):
         raise InputError("--random-features and --cross-correlation belong to the paper's method: give --paper too")
@@ -163,7 +159,8 @@ def _infer(
     _check_inside(prior, plain, known.fit_std)
     summary: Summary = estimates(drive, noise)
     if options.paper:
-        summary = cross_correlation(drive) if options.cross_correlation else paper_statistics(drive)
+        crossed = CrossCorrelation(drive.starts, drive.roll_rad)
+        summary = crossed if options.cross_correlation else PaperStatistics(drive.starts)
     simulator = Simulator(nominal, drive, noise, known.factor)
     observed = summary(drive.pose[None])[0]
     widened = 0 if options.paper else WIDENING_SIMULATIONS
@@ -195,7 +192,6 @@ def _infer(
         noise,
         simulator,
         summary,
-        prior,
         observed,
         fitted,
         draws[0],
@@ -206,7 +202,6 @@ def _infer(
         calibration,
         effective_simulations(fitted, observed),
         tuple(undetermined(draws[0], prior.low, prior.high, drive, options.paper)),
-        perf_counter() - began,
     )
 
 

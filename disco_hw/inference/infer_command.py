@@ -174,7 +174,7 @@ def diagnostics(inference: Inference) -> dict[str, Any]:
 def _disagreements(inference: Inference) -> list[str]:
     check = inference.predictive
     lines = [
-        f"warning: {one.name}: {one.description}, {abs(deviation):.0f} standard deviations from every simulation "
+        f"warning: {one.name}: {one.symptom.value}, {abs(deviation):.0f} standard deviations from every simulation "
         f"(as {' or '.join(one.effects)} would do)"
         for one, deviation in check.disagreements
     ]

@@ -5,7 +5,7 @@ Both are found from what a geometry leaves unexplained of the path, over windows
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -60,21 +60,9 @@ class Noise:
     lever_m: float = 0.0
     speed_share: float = 0.0
 
-    def vector(self) -> Array:
-        """Return the five standard deviations in order, (5,)."""
-        return np.array(
-            [
-                self.position_m,
-                self.yaw_rad,
-                self.slip_forward_m_sqrt_s,
-                self.slip_left_m_sqrt_s,
-                self.slip_yaw_rad_sqrt_s,
-            ]
-        )
-
     def scales(self) -> Array:
         """Return the five standard deviations, the correlation time and the lever, (7,)."""
-        return np.append(self.vector(), [self.correlation_s, self.lever_m])
+        return np.array(astuple(self)[:-1])
 
     def about_the_point(self) -> Noise:
         """Return noise of the same variances without a lever."""
@@ -86,10 +74,7 @@ USUAL = Noise(0.005, 0.01, 0.005, 0.005, 0.015)
 
 
 def slip_intensity(drive: Excitation, speed_share: float) -> tuple[Array, Array]:
-    """Return the growth (s) of the slip's variance, relative to its mean while moving.
-
-    At each node (M,), and up to each pose from the one before (P,).
-    """
+    """Growth (s) of slip's variance over its mean in motion: at nodes (M,), and up to each pose from the last (P,)."""
     window = np.ones(2 * MOVING_SPREAD_STEPS + 1) / (2 * MOVING_SPREAD_STEPS + 1)
     square = np.convolve((drive.wheel_rad_s**2).mean(axis=1), window, mode="same")
     usual = float(square @ drive.moving) / max(float(drive.moving.sum()), 1.0)
@@ -131,10 +116,7 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
     for lag in sorted({max(1, round(lag_s / period_s)) for lag_s in _LAGS_S}):
         windows = _windows(drive, error, turned, by_speed_s, lag)
         length_s = lag * period_s
-        for moves, chosen in (
-            (False, windows.moving_s < 0.05 * length_s),
-            (True, windows.moving_s > 0.9 * length_s),
-        ):
+        for moves, chosen in ((False, windows.moving_s < 0.05 * length_s), (True, windows.moving_s > 0.9 * length_s)):
             if np.count_nonzero(chosen) >= _FEWEST_WINDOWS:
                 part = _chosen(windows, chosen, 0.5 if lag > 1 else 1.0)
                 rows.append(part)
@@ -157,14 +139,9 @@ def measured_noise(drive: Excitation, theta: Array) -> Noise:
 
 
 def _chosen(windows: _Windows, chosen: NDArray[np.bool_], independent: float) -> _Windows:
-    return _Windows(
-        windows.error[chosen],
-        windows.moving_s[chosen],
-        windows.intensity[chosen],
-        windows.growth,
-        windows.sensor[chosen],
-        independent * np.count_nonzero(chosen),
-    )
+    count = independent * np.count_nonzero(chosen)
+    error, moving_s, intensity = windows.error[chosen], windows.moving_s[chosen], windows.intensity[chosen]
+    return _Windows(error, moving_s, intensity, windows.growth, windows.sensor[chosen], count)
 
 
 def _variance(squares: Array) -> Array:

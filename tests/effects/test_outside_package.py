@@ -47,7 +47,7 @@ import numpy as np
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL, pose_sensor
 from disco_hw.gap.search.richest_model import candidates_of, smooth_of
-from disco_hw.gap.search.analysis import OUTSIDE_TESTS, confounded_with
+from disco_hw.gap.search.analysis import confounded_with
 from disco_hw.gap.search.analysis import _OF_TURNING
 from disco_hw.inference.checks import CHECKS
 from disco_hw.log import records
@@ -69,7 +69,7 @@ print(json.dumps({
     "fan_m": np.ptp(fan[:, -1], axis=0).tolist(),
     "points": len(fan),
     "confounded": confounded_with(("lateral_icr",), False),
-    "decided": OUTSIDE_TESTS[frozenset(("mast_lean", "lateral_icr"))],
+    "decided": REGISTRY["mast_lean"].mimics.decided_by,
     "sits_left_m": pose_sensor(leaning).left_m,
     "of_turning": _OF_TURNING,
     "checks": {check.name: check.effects for check in CHECKS},

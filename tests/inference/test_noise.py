@@ -29,16 +29,16 @@ def test_the_noise_of_a_simulated_log_is_found():
     found = []
     for seed in range(4):
         drive, poses = simulated(seed)
-        found.append(measured_noise(with_poses(drive, poses), THETA).vector())
-    assert np.mean(found, axis=0) == pytest.approx(TRUE.vector(), rel=0.25)
+        found.append(measured_noise(with_poses(drive, poses), THETA).scales()[:5])
+    assert np.mean(found, axis=0) == pytest.approx(TRUE.scales()[:5], rel=0.25)
 
 
 def test_jumps_of_the_sensor_do_not_count():
     drive, poses = simulated(1)
-    clean = measured_noise(with_poses(drive, poses), THETA).vector()
+    clean = measured_noise(with_poses(drive, poses), THETA).scales()[:5]
     jumpy = poses.copy()
     jumpy[::97, 0] += 0.5
-    assert measured_noise(with_poses(drive, jumpy), THETA).vector() == pytest.approx(clean, rel=0.5)
+    assert measured_noise(with_poses(drive, jumpy), THETA).scales()[:5] == pytest.approx(clean, rel=0.5)
 
 
 def test_the_plants_noise_is_found_at_its_own_estimate():
@@ -77,8 +77,8 @@ def test_how_long_slip_keeps_its_direction_is_found(true_s, low_s, high_s):
     found = found_in_simulations(replace(TRUE, correlation_s=true_s))
     assert low_s <= np.median([one.correlation_s for one in found]) <= high_s
     # What it adds up to is the same, however long it lasts.
-    rates = np.median([one.vector() for one in found], axis=0)[2:]
-    assert rates == pytest.approx(TRUE.vector()[2:], rel=0.3)
+    rates = np.median([one.scales()[:5] for one in found], axis=0)[2:]
+    assert rates == pytest.approx(TRUE.scales()[2:5], rel=0.3)
 
 
 @pytest.mark.parametrize("true_m", [0.0, 0.2])
@@ -93,7 +93,7 @@ def test_slip_about_the_centre_of_rotation_is_counted_neither_to_the_left_nor_fo
         TRUE, slip_forward_m_sqrt_s=0.005, slip_left_m_sqrt_s=0.0, slip_yaw_rad_sqrt_s=0.06, lever_m=0.25,
         correlation_s=0.15,
     )  # fmt: skip
-    forward, left = np.median([one.vector()[2:4] for one in found_in_simulations(true)], axis=0)
+    forward, left = np.median([one.scales()[2:4] for one in found_in_simulations(true)], axis=0)
     assert forward == pytest.approx(0.005, rel=0.2)
     # No less than a quarter of the slip forward is ever counted.
     assert left < 0.3 * forward
@@ -110,10 +110,10 @@ def test_one_minute_of_a_circle_tells_the_slip_without_bias():
     simulator = Simulator(Model(0.06, 0.4), drive, TRUE)
     seeds = np.arange(24, dtype=np.uint32)
     found = [
-        measured_noise(with_poses(drive, poses), THETA).vector()
+        measured_noise(with_poses(drive, poses), THETA).scales()[:5]
         for poses in simulator.poses(np.repeat(THETA[None], seeds.size, axis=0), seeds)
     ]
-    ratio = np.array(found) / TRUE.vector()
+    ratio = np.array(found) / TRUE.scales()[:5]
     assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.15)
     assert np.quantile(ratio, 0.1, axis=0).min() > 0.6
 

@@ -44,7 +44,8 @@ _UNLIMITED = 1e6
 class Layout:
     """Columns of a channel's vector, its neutral point, how each varies; `of_wheels`: which of the two channels.
 
-    `precision`: how surely an entry is near its neutral value before a log is looked at, mostly 0.
+    `precision`: how surely an entry is near its neutral value before a log is looked at, mostly 0. `spans`: where the
+    parameters of each effect are, which follow each other.
     """
 
     of_wheels: bool
@@ -55,6 +56,7 @@ class Layout:
     high: Array
     precision: Array
     place: Mapping[str, int]
+    spans: Mapping[str, slice]
 
     def at(self, p: Array, name: str) -> float:
         """One entry of a vector."""
@@ -63,6 +65,12 @@ class Layout:
 
 def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
     columns = tuple(parameters)
+    place = {name: k for k, name in enumerate(columns)}
+    spans = {
+        name: slice(place[effect.columns[0]], place[effect.columns[0]] + len(effect.columns))
+        for name, effect in REGISTRY.items()
+        if effect.columns[0] in place
+    }
     neutral = np.array([min(p.neutral, _UNLIMITED) for p in parameters.values()])
     low = np.array([p.low if p.least_fitted is None else p.least_fitted for p in parameters.values()])
     return Layout(
@@ -75,7 +83,8 @@ def _layout(parameters: Mapping[str, Parameter], base: int) -> Layout:
         low=low,
         high=np.array([max(p.high, p.neutral if p.neutral < np.inf else _UNLIMITED) for p in parameters.values()]),
         precision=np.array([p.expected**-2.0 for p in parameters.values()]),
-        place=MappingProxyType({name: k for k, name in enumerate(columns)}),
+        place=MappingProxyType(place),
+        spans=MappingProxyType(spans),
     )
 
 
@@ -94,24 +103,8 @@ BODY = _layout(
 )
 
 
-def _spans(layout: Layout) -> Mapping[str, slice]:
-    """Return the slice of each effect's parameters, which follow each other."""
-    first: dict[str, int] = {}
-    count: dict[str, int] = {}
-    for k, column in enumerate(layout.columns):
-        name = column.partition(".")[0]
-        first.setdefault(name, k)
-        count[name] = count.get(name, 0) + 1
-    return MappingProxyType({name: slice(first[name], first[name] + count[name]) for name in first})
-
-
-_SPANS: Mapping[bool, Mapping[str, slice]] = MappingProxyType(
-    {layout.of_wheels: _spans(layout) for layout in (WHEEL, BODY)}
-)
-
-
 def _coefficients(layout: Layout, p: Array, name: str, base: tuple[float, ...]) -> tuple[float, ...]:
-    return _kept(name, tuple(p[_SPANS[layout.of_wheels][name]].tolist()), base)
+    return _kept(name, tuple(p[layout.spans[name]].tolist()), base)
 
 
 # From one free run to the next most effects stay as they are.
@@ -134,10 +127,7 @@ ENCODER_COLUMNS = tuple(column for effect in _ENCODERS for column in effect.colu
 _POSE_TIME, _POSE, _WORLD = in_stages(Stage.POSE_TIME), in_stages(Stage.POSE), in_stages(Stage.WORLD)
 _ARGUMENTS = {effect.name: arguments_of(effect.plain) for effect in (*_ENCODERS, *_POSE_TIME, *_POSE, *_WORLD)}
 _SENSED = np.array(
-    [
-        *range(BASE_COUNT),
-        *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE) for column in effect.columns),
-    ]
+    [*range(BASE_COUNT), *(BODY.place[column] for effect in (*_POSE_TIME, *_POSE) for column in effect.columns)]
 )
 
 
@@ -175,7 +165,7 @@ def carried(p: Array, speed_rad_s: Array, t_s: Array) -> Array:
     `p`: vector of the body channel; `speed_rad_s` (M, 2): measured wheel speeds; `t_s` (M,): times of the nodes.
     """
     moved = np.zeros_like(speed_rad_s)
-    places = [(effect, _SPANS[False][effect.name]) for effect in _WORLD]
+    places = [(effect, BODY.spans[effect.name]) for effect in _WORLD]
     acting = [effect for effect, place in places if (p[place] != BODY.neutral[place]).any()]
     # Most robots stand on level ground, and it is asked in every run.
     if not acting:
@@ -201,11 +191,7 @@ def counted(layout: Layout, p: Array) -> tuple[float, float]:
 
 def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) -> Any:
     """Evaluate an effect's plain equation for the motion of one second, with the parameters of a vector."""
-    known: dict[str, Any] = {
-        "values": tuple(p[_SPANS[layout.of_wheels][effect.name]].tolist()),
-        "step_s": 1.0,
-        **motion,
-    }
+    known: dict[str, Any] = {"values": tuple(p[layout.spans[effect.name]].tolist()), "step_s": 1.0, **motion}
     known["geometry"] = tuple(p[:BASE_COUNT].tolist())
     return effect.plain(**{name: known[name] for name in _ARGUMENTS[effect.name]})
 
@@ -213,7 +199,7 @@ def _plain(layout: Layout, p: Array, effect: Effect, **motion: float | Array) ->
 def wheel_effects(p: Array, geometry: Array) -> Coefficients:
     """Return the coefficients of the model's wheel step at a vector; `geometry` (3,) serves yaw-rate limits."""
     base = tuple(geometry[:BASE_COUNT].tolist())
-    absent = [name for name in _HOLDING if (p[_SPANS[True][name]] == WHEEL.neutral[_SPANS[True][name]]).all()]
+    absent = [name for name in _HOLDING if (p[WHEEL.spans[name]] == WHEEL.neutral[WHEEL.spans[name]]).all()]
     given = {name: _coefficients(WHEEL, p, name, base) for name in WHEEL_MOTION if name not in absent}
     made: Coefficients = Effects(**{name: given.get(name) for name in MOTION_EFFECTS})
     return made

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.stamp_clock import StampClock, clock_of
+from disco_hw.gap.data.stamp_clock import StampClock, clock_of, picked
 from disco_hw.gap.data.timing import apart, lowest, mismatch_of, most_distinct_delay, scanned_delays
 from disco_hw.gap.settings import GridSettings
 from disco_hw.jit import kernel_function
@@ -51,17 +51,7 @@ class Turned:
 
     def between(self, low_s: float, high_s: float) -> Turned:
         """Return the pairs that begin in a span of time."""
-        return self.pick((self.begin_s >= low_s) & (self.begin_s < high_s))
-
-    def pick(self, chosen: Mask) -> Turned:
-        """Return the chosen pairs."""
-        return Turned(
-            self.begin_s[chosen],
-            self.end_s[chosen],
-            self.segment[chosen],
-            self.left_rad[chosen],
-            self.right_rad[chosen],
-        )
+        return picked(self, (self.begin_s >= low_s) & (self.begin_s < high_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +86,13 @@ class WheelResponse:
         for place, delay_s in enumerate(delays.tolist()):
             known = self.known(turned, delay_s)
             if np.count_nonzero(known) >= fewest:
-                mismatch[place] = self._mismatch(turned.pick(known), delay_s)
+                mismatch[place] = self._mismatch(picked(turned, known), delay_s)
         return mismatch
 
     def is_distinct(self, turned: Turned, delay_s: float, reach_s: float) -> bool:
         """Whether the same pairs fit worse at a delay that is shorter, and at one that is longer, by `reach_s`."""
         delays = (delay_s - reach_s, delay_s, delay_s + reach_s)
-        shared = turned.pick(np.all([self.known(turned, each) for each in delays], axis=0))
+        shared = picked(turned, np.all([self.known(turned, each) for each in delays], axis=0))
         if not shared.begin_s.size:
             return False
         shorter, there, longer = (self._mismatch(shared, each) for each in delays)
@@ -128,10 +118,7 @@ class WheelResponse:
         return k, np.maximum(t_s - self.commands.t_s[k], 0.0)
 
     def _unknown(self, t_s: Array, segment: Index) -> tuple[Array, Mask]:
-        """Return the time (s) without a known command until some times (n,), and a validity mask.
-
-        The mask (n,) says whether commands of the segment are in force there.
-        """
+        """Time (s) without a known command until some times (n,), and whether the segment's commands are in force."""
         commands = self.commands
         k, since_s = self._in_force(t_s)
         inside = (commands.segment[k] == segment) & (t_s >= commands.t_s[0]) & (t_s <= commands.t_s[-1])

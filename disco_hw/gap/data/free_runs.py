@@ -81,15 +81,7 @@ def _turned(cosine: float, sine: float, half: float) -> tuple[float, float]:
 
 @kernel_function
 def _run_body(
-    base: Any,
-    effects: Any,
-    scale: Any,
-    angle: Array,
-    speed: Array,
-    extra: Array,
-    first: Mask,
-    t_s: Array,
-    track: Array,
+    base: Any, effects: Any, scale: Any, angle: Array, speed: Array, extra: Array, first: Mask, t_s: Array, track: Array
 ) -> None:
     x = y = yaw = 0.0
     c, s = 1.0, 0.0
@@ -277,6 +269,12 @@ def displacement(
     return out
 
 
+def rotated(moved: Array, angle: Array) -> Array:
+    """Turn displacements (n, 2) counter-clockwise by angles (n,), in rad."""
+    cosine, sine = np.cos(angle), np.sin(angle)
+    return np.column_stack([cosine * moved[:, 0] - sine * moved[:, 1], sine * moved[:, 0] + cosine * moved[:, 1]])
+
+
 def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, settings: GridSettings) -> Index:
     """Nodes (K,), `start_every_s` apart, from which a prediction stays within its run and on usable nodes."""
     ahead, stride = round(ahead_s / GRID_STEP_S), round(settings.start_every_s / GRID_STEP_S)
@@ -293,10 +291,7 @@ def starts_of(first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: floa
 def starts_as_far_as(
     first: NDArray[np.bool_], usable: NDArray[np.bool_], ahead_s: float, settings: GridSettings
 ) -> tuple[Index, float]:
-    """Return nodes (K,) where predictions start, and their length (s): `ahead_s`, or a half or a quarter of it.
-
-    The length is the longest of the three for which there is a start, and a quarter if there is none.
-    """
+    """Nodes (K,) where predictions start, and their length, `ahead_s`, or half or a quarter if none reaches so far."""
     for share in (1.0, 0.5, 0.25):
         start = starts_of(first, usable, share * ahead_s, settings)
         if start.size:

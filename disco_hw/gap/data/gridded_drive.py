@@ -11,14 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from disco_hw.gap.data.command_timing import command_clock
-from disco_hw.gap.data.stamp_clock import Aligned, StampClock, aligned
+from disco_hw.gap.data.stamp_clock import Aligned, aligned, joined
 from disco_hw.gap.data.timing import pose_clock, tick_s
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, OF_MEDIAN, Folds, GapSettings, GridSettings
 from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels
@@ -36,10 +35,6 @@ class GridSamples:
     fraction: Array
     t_s: Array
     block: Index
-
-    def pick(self, chosen: Mask | Index) -> GridSamples:
-        """Return the chosen samples."""
-        return GridSamples(self.node[chosen], self.fraction[chosen], self.t_s[chosen], self.block[chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +126,10 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
     """Lay a drive on the grid; a log without wheel samples has an empty one."""
     grid_settings = settings.grid
     wheels = undo_sample_hold(log.wheels, grid_settings)
-    timed = _timed(log, wheels, grid_settings)
+    timed_commands, timed_poses, commands_moved_s, timing_notes = _timed(log, wheels, grid_settings)
     ticks_s = {"commands": tick_s(log.commands.t_s, log.wheels.t_s), "poses": tick_s(log.poses.t_s, log.wheels.t_s)}
     scatter_s = {whose: each_s / 12.0**0.5 for whose, each_s in ticks_s.items()}
-    command_samples, poses, notes = timed.commands.samples, timed.poses.samples, [*timed.notes]
+    command_samples, poses, notes = timed_commands.samples, timed_poses.samples, [*timing_notes]
     notes += [
         f"{whose} are stamped by the rows of the log, {1e3 * ticks_s[whose]:.0f} ms apart: how late they are is known "
         f"to {2e3 * each_s:.0f} ms at best"
@@ -184,7 +179,7 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         return _empty(settings)
     if foreign_s > 0.0:
         notes.append(f"{foreign_s:.0f} s in which wheels and commands have nothing to do with each other are left out")
-    encoder = _joined(encoder_at)
+    encoder = joined(encoder_at)
     measured = np.concatenate(encoder_angle)
     return GriddedDrive(
         t_s=np.concatenate(nodes_t),
@@ -200,57 +195,45 @@ def grid_drive(log: DriveLog, settings: GapSettings = DEFAULT_SETTINGS) -> Gridd
         quantum_rad=_quantum(np.column_stack([wheels.left_angle_rad, wheels.right_angle_rad]))
         if wheels.angle_measured
         else 0.0,
-        pose=_joined(pose_at),
+        pose=joined(pose_at),
         pose_values=np.concatenate(pose_values),
         notes=tuple(notes),
         settings=settings,
-        pose_delay_s=timed.poses.delay_s,
-        pose_clock_even=timed.poses.even,
-        commands_moved_s=timed.commands_moved_s,
-        commands_timed=timed.commands.known,
-        poses_moved_s=timed.poses.delay_s,
-        command_stamps_s=math.hypot(scatter_s["commands"], timed.commands.apart_s),
-        pose_stamps_s=math.hypot(scatter_s["poses"], timed.poses.apart_s),
+        pose_delay_s=timed_poses.delay_s,
+        pose_clock_even=timed_poses.even,
+        commands_moved_s=commands_moved_s,
+        commands_timed=timed_commands.known,
+        poses_moved_s=timed_poses.delay_s,
+        command_stamps_s=math.hypot(scatter_s["commands"], timed_commands.apart_s),
+        pose_stamps_s=math.hypot(scatter_s["poses"], timed_poses.apart_s),
         log_begins_s=log.begins_s,
     )
 
 
-class _Timed(NamedTuple):
-    """Commands and poses where they belong beside the wheels at first sight, and by how much they were moved."""
-
-    commands: Aligned[Commands]
-    poses: Aligned[Poses]
-    commands_moved_s: float
-    notes: tuple[str, ...]
-
-
-def _timed(log: DriveLog, wheels: Wheels, settings: GridSettings) -> _Timed:
-    def of_poses(wheels: Wheels, poses: Poses) -> tuple[StampClock, bool]:
-        return pose_clock(wheels, poses, settings), True
-
-    def of_commands(wheels: Wheels, commands: Commands) -> tuple[StampClock, bool]:
-        return command_clock(wheels, commands, settings)
-
-    poses = aligned(wheels, log.poses, log.begins_s, of_poses, settings.least_clock_error_s, "poses'")
-    aligned_commands = aligned(
-        wheels, log.commands, log.begins_s, of_commands, settings.least_link_error_s, "commands'"
-    )
-    notes = (*poses.notes, *aligned_commands.notes)
-    if not aligned_commands.known:
+def _timed(
+    log: DriveLog, wheels: Wheels, settings: GridSettings
+) -> tuple[Aligned[Commands], Aligned[Poses], float, tuple[str, ...]]:
+    """Commands and poses where they belong beside the wheels at first sight, by how much (s) commands moved; notes."""
+    poses = aligned(
+        wheels, log.poses, log.begins_s, lambda wheels, some: (pose_clock(wheels, some, settings), True),
+        settings.least_clock_error_s, "poses'",
+    )  # fmt: skip
+    commands = aligned(
+        wheels, log.commands, log.begins_s, lambda wheels, some: command_clock(wheels, some, settings),
+        settings.least_link_error_s, "commands'",
+    )  # fmt: skip
+    notes = (*poses.notes, *commands.notes)
+    if not commands.known:
         text = (
             f"wheels answer commands more slowly than behind a lag of {max(settings.lags_s):g} s, or more than "
             f"{settings.most_pose_delay_s:g} s late or early, or commands hardly change: how late commands are stamped "
             "is not known from this log"
         )
         notes = (*notes, text)
-    later_s = (
-        _to_borders(aligned_commands.samples, float(wheels.t_s[0]), -aligned_commands.delay_s)
-        if wheels.t_s.size
-        else 0.0
-    )
-    commands = replace(aligned_commands.samples, t_s=_moved(aligned_commands.samples.t_s, later_s))
+    later_s = _to_borders(commands.samples, float(wheels.t_s[0]), -commands.delay_s) if wheels.t_s.size else 0.0
+    asked = replace(commands.samples, t_s=_moved(commands.samples.t_s, later_s))
     seen = replace(poses.samples, t_s=_moved(poses.samples.t_s, -poses.delay_s))
-    return _Timed(replace(aligned_commands, samples=commands), replace(poses, samples=seen), later_s, notes)
+    return replace(commands, samples=asked), replace(poses, samples=seen), later_s, notes
 
 
 def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
@@ -267,10 +250,7 @@ def _to_borders(commands: Commands, begin_s: float, later_s: float) -> float:
 
 
 def _moved(t_s: Array, by_s: float) -> Array:
-    """Return times (s) shifted by `by_s` and rounded to the nanosecond.
-
-    The last digits would decide on which side of a cell's border a sample lies.
-    """
+    """Return times shifted by `by_s`, to the nanosecond: the last digits would decide the cell of a sample."""
     return np.asarray(np.round(t_s + by_s, 9))
 
 
@@ -351,15 +331,6 @@ def _locate(t_s: Array, grid: Array, offset: int, block_s: float) -> GridSamples
     return GridSamples(node + offset, place - node, t_s, np.floor(t_s / block_s).astype(np.int64))
 
 
-def _joined(parts: list[GridSamples]) -> GridSamples:
-    return GridSamples(
-        np.concatenate([part.node for part in parts]),
-        np.concatenate([part.fraction for part in parts]),
-        np.concatenate([part.t_s for part in parts]),
-        np.concatenate([part.block for part in parts]),
-    )
-
-
 def _command_cells(commands: Commands, segment: int, grid: Array) -> tuple[Array, Array]:
     """Mean command over each cell (M, 2), exact for commands held until the next, and the squared jumps in it (M,)."""
     inside = commands.segment == segment
@@ -417,21 +388,9 @@ def _empty(settings: GapSettings) -> GriddedDrive:
     nothing, pairs = np.empty(0), np.empty((0, 2))
     samples = GridSamples(np.empty(0, np.int64), nothing, nothing, np.empty(0, np.int64))
     return GriddedDrive(
-        nothing,
-        np.empty(0, bool),
-        pairs,
-        nothing,
-        pairs,
-        pairs,
-        samples,
-        pairs,
-        0.0,
-        0.0,
-        0.0,
-        samples,
-        np.empty((0, 3)),
-        settings=settings,
-    )
+        nothing, np.empty(0, bool), pairs, nothing, pairs, pairs, samples, pairs, 0.0, 0.0, 0.0, samples,
+        np.empty((0, 3)), settings=settings,
+    )  # fmt: skip
 
 
 def undo_sample_hold(wheels: Wheels, settings: GridSettings) -> Wheels:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import pairwise
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,8 +16,13 @@ from numpy.typing import NDArray
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
 
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
 Array = NDArray[np.float64]
 Samples = TypeVar("Samples", Commands, Poses)
+Stamped = TypeVar("Stamped", Commands, Poses, Wheels)
+Columns = TypeVar("Columns", bound="DataclassInstance")
 
 
 class Alignment(Protocol):
@@ -66,10 +71,7 @@ class StampClock:
         return np.asarray(drift + self.jump_s * ((t_s >= self.jump_at_s) - 0.5))
 
     def corrected(self, samples: Samples) -> Samples:
-        """Return the samples with the time stamps that an even clock would give.
-
-        Samples that a jump of the clock puts before an earlier one are left out.
-        """
+        """Return samples with time stamps of an even clock, but for those that a jump puts before an earlier one."""
         t_s = samples.t_s - self.off_s(samples.t_s)
         keep = t_s > np.concatenate([[-np.inf], np.maximum.accumulate(t_s)[:-1]])
         return replace(picked(samples, keep), t_s=t_s[keep])
@@ -90,10 +92,22 @@ class StampClock:
         return ()
 
 
-def picked(samples: Samples, chosen: NDArray[np.bool_]) -> Samples:
-    """Return the samples that a mask (n,) selects."""
-    columns = {each.name: getattr(samples, each.name)[chosen] for each in fields(samples)}
-    return replace(samples, **columns)
+def picked(of: Columns, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Columns:
+    """Return the samples that a mask or places select, of a dataclass with columns (n,)."""
+    values = ((each.name, getattr(of, each.name)) for each in fields(of))
+    columns: dict[str, Any] = {name: value[chosen] for name, value in values if isinstance(value, np.ndarray)}
+    return replace(of, **columns)
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Return the samples of all parts in a row, of a dataclass with columns only."""
+    columns = {each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(parts[0])}
+    return replace(parts[0], **columns)
+
+
+def between(of: Stamped, begin_s: float, end_s: float) -> Stamped:
+    """Return the samples that are stamped in a span of time."""
+    return picked(of, (of.t_s >= begin_s) & (of.t_s < end_s))
 
 
 def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, least_nats: float) -> StampClock:
@@ -107,8 +121,8 @@ def clock_of(align: Alignment, settings: GridSettings, least_error_s: float, lea
     plain = StampClock(delay_s)
     first, last = align.span_s
     middles, delays = by_stretch(align)
-    few = delays.size < settings.fewest_clock_stretches
-    if few or middles[-1] - middles[0] < settings.least_clock_share * (last - first):
+    # A step has two stretches on either side.
+    if delays.size < 4 or middles[-1] - middles[0] < settings.least_clock_share * (last - first):
         return plain
     centred = (middles - 0.5 * (first + last)) / (last - first)
     far_s = settings.clock_outlier_s
@@ -221,7 +235,7 @@ def aligned(
     or "commands'".
     """
     edges_s = [-np.inf, *(begin_s - _EARLY_S for begin_s in begins_s[1:]), np.inf]
-    logs = [(_between(wheels, *span), _between(samples, *span)) for span in pairwise(edges_s)]
+    logs = [(between(wheels, *span), between(samples, *span)) for span in pairwise(edges_s)]
     seen = [clock_of(*log) for log in logs] if len(logs) > 1 else []
     clocks = [(clock, known and clock.delay_s != 0.0) for clock, known in seen]
     delays = [clock.delay_s for clock, known in clocks if known]
@@ -250,22 +264,6 @@ def aligned(
             f"the {whose} delay against the wheels differs from log to log ({listed}): each log is laid by its own, as"
             f" if it were {middle_s:.3g} s in all; synchronise the clocks"
         )
-    joined = {each.name: np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(samples)}
     return Aligned(
-        replace(samples, **joined),
-        middle_s,
-        True,
-        not uneven,
-        float(np.std(delays, ddof=1)) if apart else 0.0,
-        tuple(notes),
+        joined(parts), middle_s, True, not uneven, float(np.std(delays, ddof=1)) if apart else 0.0, tuple(notes)
     )
-
-
-_Part = TypeVar("_Part", Commands, Wheels, Poses)
-
-
-def _between(of: _Part, begin_s: float, end_s: float) -> _Part:
-    inside = (of.t_s >= begin_s) & (of.t_s < end_s)
-    values = ((each.name, getattr(of, each.name)) for each in fields(of))
-    chosen: dict[str, Any] = {name: value[inside] for name, value in values if isinstance(value, np.ndarray)}
-    return replace(of, **chosen)

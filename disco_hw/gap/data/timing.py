@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from disco_hw.gap.data.stamp_clock import StampClock, clock_of, picked
+from disco_hw.gap.data.stamp_clock import StampClock, between, clock_of
 from disco_hw.gap.settings import OF_MEDIAN, GridSettings
 from disco_hw.jit import kernel_function, scalar_function
 from disco_hw.log.drive import Poses, Wheels
@@ -61,15 +61,12 @@ class PoseAlignment:
 
     def part_delay_s(self, low_s: float, high_s: float) -> float | None:
         """Age of the poses of a stretch; None where it does not show."""
-        return pose_delay_s(self.wheels, self._part(low_s, high_s), self.settings) or None
+        return pose_delay_s(self.wheels, between(self.poses, low_s, high_s), self.settings) or None
 
     def part_mismatch(self, low_s: float, high_s: float, delay_s: float) -> float:
         """Misfit of all poses of a stretch at an age."""
-        part = self._part(low_s, high_s)
+        part = between(self.poses, low_s, high_s)
         return part.t_s.size * _mismatch_at(self.wheels, part, delay_s, self.settings)
-
-    def _part(self, low_s: float, high_s: float) -> Poses:
-        return picked(self.poses, (self.poses.t_s >= low_s) & (self.poses.t_s < high_s))
 
 
 def pose_clock(wheels: Wheels, poses: Poses, settings: GridSettings) -> StampClock:
@@ -111,7 +108,7 @@ def _mismatch_at(wheels: Wheels, poses: Poses, delay_s: float, settings: GridSet
 def _mismatches(wheels: Wheels, poses: Poses, delays: Array, settings: GridSettings) -> Array:
     """Minus the log likelihood per pose at each of some delays (D,); infinite where the poses are too few."""
     mismatch = np.full(delays.size, np.inf)
-    before, after = _pairs(poses, settings.delay_span_s)
+    before, after = apart(poses.t_s, poses.segment, settings.delay_span_s)
     turn = np.remainder(poses.yaw_rad[after] - poses.yaw_rad[before] + np.pi, 2.0 * np.pi) - np.pi
     heading = poses.yaw_rad[before] + 0.5 * turn
     way = (poses.x_m[after] - poses.x_m[before]) * np.cos(heading)
@@ -130,11 +127,6 @@ def _mismatches(wheels: Wheels, poses: Poses, delays: Array, settings: GridSetti
         difference, total = right - left, right + left
         mismatch[place] = sum(mismatch_of(difference, total, measured[known]) for measured in (turn, way))
     return mismatch
-
-
-def _pairs(poses: Poses, span_s: float) -> tuple[Index, Index]:
-    """Pairs of poses of one segment that lie `span_s` apart, or little more."""
-    return apart(poses.t_s, poses.segment, span_s)
 
 
 def _bounds(wheels: Wheels, segment: Index) -> tuple[Array, Array]:

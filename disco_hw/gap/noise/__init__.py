@@ -38,7 +38,19 @@ def _huber(white: Array, limit: float) -> float:
     return float(flat @ flat - beyond @ beyond)
 
 
-def _minimise(objective, start: Array, low: Array, high: Array, most: int, step: float) -> Array:  # type: ignore[no-untyped-def]
+def _fitted(
+    mismatch: Callable[[Array], float], usual: Array, begin: Array, low: Array, high: Array, most: int,
+    settings: NoiseSettings,
+) -> Array:  # fmt: skip
+    """Logarithms of the noise of least mismatch from `low` to `high`, after `most` steps.
+
+    A weak Gaussian prior about the `usual` ones keeps those there of which the log says nothing.
+    """
+    step = settings.difference_step
+
+    def objective(logs: Array) -> float:
+        return mismatch(logs) + 0.5 * float((((logs - usual) / settings.prior_sd) ** 2).sum())
+
     def slope(logs: Array) -> Array:
         # Central: a one-sided difference this wide would end the search some way off.
         out = np.empty(logs.size)
@@ -49,7 +61,7 @@ def _minimise(objective, start: Array, low: Array, high: Array, most: int, step:
         return out
 
     bounds, options = list(zip(low, high, strict=True)), {"maxiter": most, "ftol": 3e-6}
-    found = minimize(objective, start, jac=slope, method="L-BFGS-B", bounds=bounds, options=options)
+    found = minimize(objective, begin, jac=slope, method="L-BFGS-B", bounds=bounds, options=options)
     return np.asarray(found.x)
 
 
@@ -63,29 +75,28 @@ def largest_command_jitter_s(drive: GriddedDrive) -> float:
     return scattered_s + settings.command_jitter_share * drive.encoder_period_s
 
 
-def wheel_mismatch(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
-    """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
-    motion, settings = channel.motion, channel.settings.noise
-    # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
-    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > channel.settings.grid.rest_rad_s)
-    likelihood = wheel_likelihood(motion, counted, raw)
+def _robust(likelihood: Callable[[Array], tuple[Array, float]], huber: float) -> Callable[[Array], float]:
+    """Minus the log likelihood in which whitened residuals beyond `huber` grow linearly."""
 
     def mismatch(logs: Array) -> float:
         white, weight = likelihood(logs)
-        return 0.5 * _huber(white, settings.huber) - weight
+        return 0.5 * _huber(white, huber) - weight
 
     return mismatch
+
+
+def wheel_mismatch(channel: WheelChannel, raw: Array) -> Callable[[Array], float]:
+    """Minus the robust log likelihood of what a model leaves of the angles (E, 2), by logarithms of the noise (7,)."""
+    motion = channel.motion
+    # A wheel at rest reads the same however coarse its encoder is, and would speak for readings without error.
+    counted = motion.use & ~motion.restart & (np.abs(motion.speed_rad_s).max(axis=1) > channel.settings.grid.rest_rad_s)
+    return _robust(wheel_likelihood(motion, counted, raw), channel.settings.noise.huber)
 
 
 def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     """Noise of the wheels by maximum likelihood of what a model leaves of the angles, (E, 2)."""
     drive, settings = channel.drive, channel.settings.noise
     start = channel.noise.vector()
-    mismatch = wheel_mismatch(channel, raw)
-
-    def objective(logs: Array) -> float:
-        return mismatch(logs) + _pull(logs, start, settings.prior_sd)
-
     # A speed that may be wrong by any amount for any time would explain wheels that do not turn at all.
     most = np.minimum(start + 5.0, WheelNoise(*settings.largest_wheel_noise).vector())
     most[_COMMAND_STAMP] = min(most[_COMMAND_STAMP], math.log(largest_command_jitter_s(drive)))
@@ -93,35 +104,16 @@ def fit_wheel_noise(channel: WheelChannel, raw: Array) -> WheelNoise:
     least = begin - 5.0
     if drive.quantum_rad > 0.0:
         least[_READING] = max(least[_READING], math.log(drive.quantum_rad / math.sqrt(12.0)))
-    return WheelNoise.from_vector(
-        _minimise(objective, np.maximum(begin, least), least, most, settings.wheel_iterations, settings.difference_step)
-    )
-
-
-def _pull(logs: Array, start: Array, prior_sd: float) -> float:
-    """Return the cost (nats) of a weak Gaussian prior on logarithms of parameters, centred at `start`.
-
-    The prior keeps parameters that the log says nothing about where they are.
-    """
-    return 0.5 * float((((logs - start) / prior_sd) ** 2).sum())
+    mismatch, begin = wheel_mismatch(channel, raw), np.maximum(begin, least)
+    return WheelNoise.from_vector(_fitted(mismatch, start, begin, least, most, settings.wheel_iterations, settings))
 
 
 def fit_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyNoise:
     """Noise of poses and body by maximum likelihood at a parameter vector and what unnamed terms add."""
     settings = channel.settings.noise
-    raw = channel.raw_residual(p, extra)
-    rim = np.abs(channel.drive.speed_rad_s).max(axis=1) * channel.geometry[0]
-    motion = channel.motion(rim)
     start = channel.noise.vector()
-    likelihood = body_likelihood(motion, raw)
-
-    def objective(logs: Array) -> float:
-        white, weight = likelihood(logs)
-        return 0.5 * _huber(white, settings.huber) - weight + _pull(logs, start, settings.prior_sd)
-
-    return BodyNoise.from_vector(
-        _minimise(objective, start, start - 5.0, start + 5.0, iterations, settings.difference_step)
-    )
+    mismatch = _robust(body_likelihood(channel.motion(), channel.raw_residual(p, extra)), settings.huber)
+    return BodyNoise.from_vector(_fitted(mismatch, start, start, start - 5.0, start + 5.0, iterations, settings))
 
 
 def without_outliers(channel: BodyChannel, p: Array, extra: Array | None = None) -> BodyChannel:
@@ -164,16 +156,15 @@ def learn_wheel_noise(channel: WheelChannel, raw: Array) -> WheelChannel:
     if 0 < wild.sum() < 0.02 * wild.size:
         channel = channel.with_noise(channel.noise, ~wild)
         white = whiten_wheels(raw, channel.gains)
-    return channel.weighted(local_weight(white, channel.gains.use, channel.settings.noise))
+    return replace(channel, weight=local_weight(white, channel.gains.use, channel.settings.noise))
 
 
 def learn_body_noise(channel: BodyChannel, p: Array, extra: Array | None = None, iterations: int = 15) -> BodyChannel:
     """Return the channel with noise estimated at `p`, without outliers, and with weights for noisier stretches."""
-    geometry = p.copy()
-    channel = without_outliers(replace(channel, geometry=geometry).with_noise(channel.noise), p, extra)
+    channel = without_outliers(replace(channel, geometry=p.copy()).with_noise(channel.noise), p, extra)
     channel = channel.with_noise(fit_body_noise(channel, p, extra, iterations))
     channel = without_outliers(channel, p, extra)
-    return channel.weighted(local_weight(channel.whitened(p, extra), channel.use, channel.settings.noise))
+    return replace(channel, weight=local_weight(channel.whitened(p, extra), channel.use, channel.settings.noise))
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,20 +186,17 @@ def sensor_noise(channel: BodyChannel, p: Array) -> SensorNoise:
     raw, measured = channel.raw_residual(p), channel.measured
     t_s, window, use = channel.samples.t_s, channel.window, channel.use
     outlier = channel.settings.noise.outlier
-    moving = [
-        _least(outlier, _second(t_s, raw[:, columns], window, use), _third(t_s, measured[:, columns], window, use))
-        for columns in (slice(0, 2), slice(2, 3))
-    ]
     resting = (np.abs(channel.drive.speed_rad_s).max(axis=1) < channel.settings.grid.rest_rad_s)[channel.samples.node]
-    at_rest = [
-        _scatter(
-            outlier, measured[:, columns], np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0), resting & use
-        )
-        for columns in (slice(0, 2), slice(2, 3))
-    ]
+    rest = np.cumsum(np.diff(window + 1e6 * ~resting, prepend=-1.0) != 0)
+
+    def of_poses(columns: slice) -> float:
+        off, poses = raw[:, columns], measured[:, columns]
+        moving = _least(outlier, _second(t_s, off, window, use), _third(t_s, poses, window, use))
+        return max(moving, _scatter(outlier, poses, rest, resting & use))
+
     speed = channel.drive.speed_rad_s.mean(axis=1)[channel.samples.node]
     of_speed = _second(t_s, speed[:, None], window, use & ~resting)
-    return SensorNoise(max(moving[0], at_rest[0]), max(moving[1], at_rest[1]), _sigma(outlier, of_speed))
+    return SensorNoise(of_poses(slice(0, 2)), of_poses(slice(2, 3)), _sigma(outlier, of_speed))
 
 
 def _second(t_s: Array, values: Array, window: NDArray[np.int64], use: Mask) -> Array:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
@@ -47,18 +47,7 @@ class BodyNoise:
 
     def vector(self) -> Array:
         """Return the logarithms of all nine values, (9,)."""
-        values = (
-            self.position_m,
-            self.yaw_rad,
-            self.stamp_s,
-            self.slip_forward_m_s,
-            self.slip_left_m_s,
-            self.slip_yaw_rad_s,
-            self.slip_correlation_s,
-            self.relative,
-            self.noise_correlation_s,
-        )
-        return np.asarray(np.log(np.array(values)))
+        return np.asarray(np.log(astuple(self)))
 
     @classmethod
     def from_vector(cls, logs: Array) -> BodyNoise:

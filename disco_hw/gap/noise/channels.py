@@ -7,7 +7,7 @@ data.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,9 @@ from numpy.typing import NDArray
 from disco_hw.gap.data import BASE_COUNT, BODY, WHEEL, Layout, carried
 from disco_hw.gap.data.free_runs import pose_residual, read_angles, run_body, run_wheels
 from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
+from disco_hw.gap.data.stamp_clock import picked
 from disco_hw.gap.noise.body_noise import BodyGains, BodyMotion, BodyNoise, body_gains, whiten_body
-from disco_hw.gap.noise.wheel_noise import (
-    WheelGains,
-    WheelMotion,
-    WheelNoise,
-    calm_speeds,
-    steady_speeds,
-    wheel_gains,
-    whiten_wheels,
-)
+from disco_hw.gap.noise.wheel_noise import WheelGains, WheelMotion, WheelNoise, mean_speeds, wheel_gains, whiten_wheels
 from disco_hw.gap.settings import GapSettings
 
 Array = NDArray[np.float64]
@@ -35,52 +28,16 @@ Mask = NDArray[np.bool_]
 _NEGLIGIBLE = 1e-5
 
 
-class ResidualChannel(Protocol):
-    """Interface of a channel for fitting and selection; n is the number of its residuals."""
-
-    @property
-    def settings(self) -> GapSettings:
-        """The settings of the analysis."""
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the parameter vector: names, ranges and neutral values."""
-
-    @property
-    def neutral(self) -> Array:
-        """The parameter vector without any effect, at the nominal geometry."""
-
-    @property
-    def inner(self) -> WheelChannel | BodyChannel:
-        """The channel itself, without unnamed terms."""
-
-    @property
-    def free(self) -> tuple[int, ...]:
-        """Entries of the vector that are fitted whatever the effects."""
-
-    @property
-    def block(self) -> Index:
-        """Block of time of each residual, (n,)."""
-
-    @property
-    def count(self) -> int:
-        """Number of residuals that are used."""
-
-    @property
-    def trusted_blocks(self) -> float:
-        """Weight of the noise model before the log is seen, as a number of blocks of time that agree with it."""
-
-    def residual(self, p: Array) -> Array:
-        """Whitened residuals (n,) at a parameter vector."""
-
-    def split(self, p: Array) -> tuple[Array, Array | None]:
-        """Entries of effects and base alone, and what unnamed terms add at the nodes, if any."""
-
-
 @dataclass(frozen=True)
 class WheelChannel:
-    """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest."""
+    """Commands in, wheel angles out; `weight` (E, 2) tames stretches that are noisier than the rest.
 
+    `layout` of its parameter vectors; `neutral`: the one without any effect; `free`: places that every fit frees.
+    """
+
+    layout: ClassVar[Layout] = WHEEL
+    neutral: ClassVar[Array] = WHEEL.neutral
+    free: ClassVar[tuple[int, ...]] = ()
     drive: GriddedDrive
     motion: WheelMotion
     gains: WheelGains
@@ -103,7 +60,7 @@ class WheelChannel:
         return p, None
 
     @classmethod
-    def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array, use: Mask | None = None) -> WheelChannel:
+    def build(cls, drive: GriddedDrive, noise: WheelNoise, geometry: Array) -> WheelChannel:
         """Build the channel with a noise model; samples without a known command are not used.
 
         `geometry` (3,): wheel radius, axial distance, x_icr, for effects that speak of the robot's motion.
@@ -112,7 +69,6 @@ class WheelChannel:
         known = np.isfinite(drive.command_rad_s[:, 0])
         # One known cell before is not enough: the run begins anew after unknown commands.
         followed = known[place.node] & known[np.maximum(place.node - 1, 0)]
-        good = followed if use is None else followed & use
         dt = np.diff(place.t_s, prepend=place.t_s[0])
         first_of_run = np.zeros(place.t_s.size, dtype=bool)
         starts = np.flatnonzero(drive.first)
@@ -122,11 +78,12 @@ class WheelChannel:
         between = np.diff(jumps[place.node + 1], prepend=0.0)
         speed = drive.speed_rad_s[place.node]
         dt = np.maximum(dt, 0.0)
-        noise_settings = drive.settings.noise
-        steady = steady_speeds(dt, speed, noise_settings)
-        motion = WheelMotion(
-            dt, calm_speeds(dt, speed, noise_settings), steady, np.maximum(between, 0.0), first_of_run | resumed, good
-        )
+        settings = drive.settings.noise
+        # An error that acted on the measured speed itself would scale the very noise it is measured by, and look like a
+        # gain.
+        calm = mean_speeds(dt, speed, settings.calm_s)
+        steady = mean_speeds(dt, speed, settings.steady_s, settings.fewest_steady)
+        motion = WheelMotion(dt, calm, steady, np.maximum(between, 0.0), first_of_run | resumed, followed)
         return cls(drive, motion, wheel_gains(noise, motion), np.ones((place.t_s.size, 2)), noise, geometry)
 
     def with_noise(self, noise: WheelNoise, use: Mask | None = None) -> WheelChannel:
@@ -142,10 +99,6 @@ class WheelChannel:
         moving = (self.motion.dt_s > 0.0) & ~self.motion.restart
         expected = np.where(moving[:, None], turned / np.maximum(self.motion.dt_s, 1e-9)[:, None], 0.0)
         return replace(self, motion=replace(self.motion, expected_rad_s=expected)).with_noise(self.noise)
-
-    def weighted(self, weight: Array) -> WheelChannel:
-        """Return the channel with other weights (E, 2)."""
-        return replace(self, weight=weight)
 
     def evenly(self, p: Array, extra: Array | None = None) -> WheelChannel:
         """Return the channel with wheel errors of equal size at every speed, and with Huber weights.
@@ -169,22 +122,8 @@ class WheelChannel:
         even = self.with_noise(noise)
         white = even.whitened(p, extra)
         size = float(np.sqrt((white[counted] ** 2).mean())) if counted.any() else 1.0
-        return even.weighted(np.minimum(1.0, settings.even_huber * size / np.maximum(np.abs(white), 1e-9)) / size)
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the parameter vector: names, ranges and neutral values."""
-        return WHEEL
-
-    @property
-    def neutral(self) -> Array:
-        """The parameter vector without any effect."""
-        return WHEEL.neutral
-
-    @property
-    def free(self) -> tuple[int, ...]:
-        """Entries of the vector that are fitted whatever the effects."""
-        return ()
+        weight = np.minimum(1.0, settings.even_huber * size / np.maximum(np.abs(white), 1e-9)) / size
+        return replace(even, weight=weight)
 
     @property
     def samples(self) -> GridSamples:
@@ -241,8 +180,13 @@ class WheelChannel:
 
 @dataclass(frozen=True)
 class BodyChannel:
-    """Channel from measured wheel angles to poses, in windows of time whose start pose is unknown."""
+    """Channel from measured wheel angles to poses, in windows of time whose start pose is unknown.
 
+    `layout` of its parameter vectors; `free`: places that every fit frees, those of the geometry.
+    """
+
+    layout: ClassVar[Layout] = BODY
+    free: ClassVar[tuple[int, ...]] = tuple(range(BASE_COUNT))
     drive: GriddedDrive
     samples: GridSamples
     measured: Array
@@ -276,29 +220,19 @@ class BodyChannel:
         `use` (P,) leaves single poses of the drive out.
         """
         window, keep = _windows(drive)
-        samples = drive.pose.pick(keep)
+        samples = picked(drive.pose, keep)
         measured = _turned_as_the_wheels(drive, samples, drive.pose_values[keep], geometry)
         chosen = np.ones(samples.t_s.size, dtype=bool) if use is None else use[keep]
         starts = np.flatnonzero(drive.first)
         ends = np.append(starts[1:], drive.t_s.size) - 1
         run = np.searchsorted(starts, samples.node, side="right") - 1
-        rim = np.abs(drive.speed_rad_s).max(axis=1) * geometry[0]
-        channel = cls(
-            drive,
-            samples,
-            measured,
-            window,
-            starts[run],
-            ends[run],
-            chosen,
-            body_gains(noise, _no_motion(samples)),
-            np.ones((samples.t_s.size, 3)),
-            noise,
-            geometry,
-        )
-        return replace(channel, gains=body_gains(noise, channel.motion(rim)))
+        # Gains and weights come with the noise.
+        nothing, none = np.empty(0), np.empty(0, dtype=bool)
+        gains = BodyGains(nothing, nothing, nothing, none, none)
+        channel = cls(drive, samples, measured, window, starts[run], ends[run], chosen, gains, nothing, noise, geometry)
+        return channel.with_noise(noise)
 
-    def motion(self, rim_m_s: Array) -> BodyMotion:
+    def motion(self) -> BodyMotion:
         """Return the robot's motion between the pose samples, from the wheels and the rough geometry."""
         drive, samples, p = self.drive, self.samples, self.geometry
         speeds = drive.speed_rad_s[samples.node]
@@ -310,40 +244,20 @@ class BodyChannel:
         step[restart] = 0.0
         dt = np.diff(samples.t_s, prepend=samples.t_s[0])
         dt[restart] = 0.0
-        moving = np.minimum(rim_m_s[samples.node] / self.settings.noise.slip_onset_m_s, 1.0)
+        rim_m_s = np.abs(speeds).max(axis=1) * p[0]
+        moving = np.minimum(rim_m_s / self.settings.noise.slip_onset_m_s, 1.0)
         return BodyMotion(dt, step[:, 0], step[:, 1], predicted[:, 2], moving, v, omega, restart, self.use)
 
-    def with_noise(self, noise: BodyNoise, geometry: Array | None = None, use: Mask | None = None) -> BodyChannel:
+    def with_noise(self, noise: BodyNoise, use: Mask | None = None) -> BodyChannel:
         """Return the channel with another noise model and weights of 1; `use` is over this channel's samples."""
-        changed = replace(
-            self,
-            noise=noise,
-            geometry=self.geometry if geometry is None else geometry,
-            use=self.use if use is None else use,
-        )
-        rim = np.abs(self.drive.speed_rad_s).max(axis=1) * changed.geometry[0]
-        return replace(
-            changed, gains=body_gains(noise, changed.motion(rim)), weight=np.ones((self.samples.t_s.size, 3))
-        )
-
-    def weighted(self, weight: Array) -> BodyChannel:
-        """Return the channel with other weights (P, 3)."""
-        return replace(self, weight=weight)
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the parameter vector: names, ranges and neutral values."""
-        return BODY
+        changed = replace(self, noise=noise, use=self.use if use is None else use)
+        gains, weight = body_gains(noise, changed.motion()), np.ones((self.samples.t_s.size, 3))
+        return replace(changed, gains=gains, weight=weight)
 
     @property
     def neutral(self) -> Array:
         """The parameter vector without any effect, at the given geometry."""
         return np.concatenate([self.geometry[:BASE_COUNT], BODY.neutral[BASE_COUNT:]])
-
-    @property
-    def free(self) -> tuple[int, ...]:
-        """Entries of the vector that are fitted whatever the effects."""
-        return tuple(range(BASE_COUNT))
 
     @property
     def block(self) -> Index:
@@ -428,9 +342,3 @@ def _turned_as_the_wheels(drive: GriddedDrive, samples: GridSamples, measured: A
     read_angles(track, samples.node, samples.fraction, expected)
     yaw = expected[:, 2] + np.unwrap(measured[:, 2] - expected[:, 2])
     return np.column_stack([measured[:, :2], yaw])
-
-
-def _no_motion(samples: GridSamples) -> BodyMotion:
-    zeros = np.zeros(samples.t_s.size)
-    flags = np.zeros(samples.t_s.size, dtype=bool)
-    return BodyMotion(zeros, zeros, zeros, zeros, zeros, zeros, zeros, ~flags, ~flags)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from disco_hw.gap.settings import DRIFT_S, NoiseSettings
+from disco_hw.gap.settings import DRIFT_S
 from disco_hw.jit import kernel_function, scalar_function
 
 Array = NDArray[np.float64]
@@ -43,16 +43,7 @@ class WheelNoise:
 
     def vector(self) -> Array:
         """Return the logarithms of all seven values, (7,)."""
-        values = (
-            self.relative,
-            self.correlation_s,
-            self.reading_rad,
-            self.stamp_s,
-            self.command_stamp_s,
-            self.drift_rad_sqrt_s,
-            self.drift_std,
-        )
-        return np.asarray(np.log(np.array(values)))
+        return np.asarray(np.log(astuple(self)))
 
     @classmethod
     def from_vector(cls, logs: Array) -> WheelNoise:
@@ -177,14 +168,7 @@ def _likelihood(
 
 @kernel_function
 def _whiten(
-    residual: Array,
-    decay: Array,
-    reach: Array,
-    gain: Array,
-    scale: Array,
-    restart: Array,
-    use: Array,
-    out: Array,
+    residual: Array, decay: Array, reach: Array, gain: Array, scale: Array, restart: Array, use: Array, out: Array
 ) -> None:
     # Both wheels in one loop: each one's filter waits for itself, and neither for the other.
     drift = fast = slow = other_drift = other_fast = other_slow = 0.0
@@ -213,21 +197,8 @@ def _whiten(
         other_slow += gain[k, 1, 2] * other
 
 
-def calm_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
-    """Measured speeds (E, 2) with less of their own noise: their mean over `calm_s` either side.
-
-    An error that acted on the measured speed itself would scale the very noise it is measured by, and look like a gain.
-    """
-    return _mean(dt_s, speed_rad_s, settings.calm_s, 0)
-
-
-def steady_speeds(dt_s: Array, speed_rad_s: Array, settings: NoiseSettings) -> Array:
-    """Estimate speeds (E, 2) without a model, as means of measured ones over `steady_s` on either side."""
-    return _mean(dt_s, speed_rad_s, settings.steady_s, settings.fewest_steady)
-
-
-def _mean(dt_s: Array, speed_rad_s: Array, span_s: float, fewest: int) -> Array:
-    """Mean speeds (E, 2) over so long before and after, and over so many samples at least."""
+def mean_speeds(dt_s: Array, speed_rad_s: Array, span_s: float, fewest: int = 0) -> Array:
+    """Mean of measured speeds (E, 2) over so long either side, and over so many samples at least."""
     if not dt_s.size:
         return speed_rad_s
     half = max(round(span_s / max(float(np.median(dt_s)), 1e-3)), fewest)

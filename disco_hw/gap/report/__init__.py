@@ -169,10 +169,7 @@ class GapReport:
         return {
             "verdict": self.verdict,
             "warnings": list(self.warnings),
-            "channels": [
-                {"name": channel.name, "significant": channel.significant, "where": channel.where}
-                for channel in self.channels
-            ],
+            "channels": [asdict(channel) for channel in self.channels],
             "effects": [
                 {
                     "name": effect.name,
@@ -191,7 +188,7 @@ class GapReport:
             ],
             "doubtful": [asdict(one) for one in self.doubtful],
             "residue": list(self.residue),
-            "events": [event.as_dict() for event in self.events],
+            "events": [asdict(event) for event in self.events],
             "blind_spots": [asdict(spot) for spot in self.blind_spots],
             "drive": self.drive,
             "gap": self._gap_dict(),

@@ -13,7 +13,6 @@ from disco_hw.effects import Stage
 from disco_hw.gap.search.analysis import FinalFit, GapAnalysis
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate, UnnamedTerm
 from disco_hw.gap.search.end_to_end import Freed, JointFit, Part
-from disco_hw.gap.search.evidence import Z95
 from disco_hw.gap.search.unnamed_terms import Term
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS, within_ranges
@@ -43,35 +42,33 @@ def at_joint_fit(part: ChannelEstimates, own_part: Part, of: Freed, joint: Joint
         if value is None:
             continue
         deviation = float(np.hypot(old.deviation, value - old.value))
-        by_name[name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
+        by_name[name] = ParameterEstimate.around(value, deviation)
         if name in part.fitted:
             off[part.fitted.index(name)] = value - old.value
     new = [name for name in (own_part.layout.columns[place] for place in own_part.active) if name not in by_name]
     places = [joint.names.index(name) for name in new]
     added = joint.covariance[np.ix_(places, places)]
     for name, variance in zip(new, np.diag(added), strict=True):
-        value, half = float(joint.value(name, of, own_part) or 0.0), Z95 * float(variance) ** 0.5
-        by_name[name] = ParameterEstimate(value, value - half, value + half)
+        by_name[name] = ParameterEstimate.around(joint.value(name, of, own_part) or 0.0, float(variance) ** 0.5)
     covariance = block_diag(part.covariance + np.diag(off**2), added) if new else part.covariance + np.diag(off**2)
     return ChannelEstimates(by_name, (*part.fitted, *new), covariance)
 
 
 def simple_model(model: Model, of: Freed, joint: JointFit) -> tuple[Model, tuple[str, ...]]:
     """Return the model with the geometry and effects of a joint fit and their joint Gaussian, and notes."""
-    deviations = dict(zip(joint.names, np.sqrt(np.diag(joint.covariance)), strict=True))
     by_name = {}
-    for name, deviation in deviations.items():
+    for name, variance in zip(joint.names, np.diag(joint.covariance).tolist(), strict=True):
         value = joint.value(name, of)
         assert value is not None
-        by_name[name] = ParameterEstimate(value, value - Z95 * float(deviation), value + Z95 * float(deviation))
+        by_name[name] = ParameterEstimate.around(value, variance**0.5)
     named = [setting.name for setting in model.effects if setting.name not in TERMS]
     named += [name.partition(".")[0] for name in joint.names if "." in name]
     effects = {}
     for name in dict.fromkeys(named):
         effects[name] = {
-            key: estimate
-            for key in (p.name for p in effect_of(name).parameters)
-            if (estimate := by_name.get(f"{name}.{key}", _given(model, name, key))) is not None
+            p.name: estimate
+            for p in effect_of(name).parameters
+            if (estimate := by_name.get(f"{name}.{p.name}", _given(model, name, p.name))) is not None
         }
     return amended_model(model, effects, {}, (ChannelEstimates(by_name, joint.names, joint.covariance),))
 
@@ -197,8 +194,7 @@ def _known_terms(model: Model, base: Mapping[str, float]) -> tuple[dict[str, Par
         if model.belief is not None and key in model.belief.names:
             place = model.belief.names.index(key)
             deviation = abs(factor) * float(model.belief.covariance()[place, place]) ** 0.5
-        value = setting.values["k"] * factor
-        found[setting.name] = ParameterEstimate(value, value - Z95 * deviation, value + Z95 * deviation)
+        found[setting.name] = ParameterEstimate.around(setting.values["k"] * factor, deviation)
         reach[setting.name] = min(setting.values[REACH.name] / factor, REACH.neutral)
     return found, reach
 

@@ -18,10 +18,10 @@ from multiprocessing.process import BaseProcess
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.effects import Effect, Parameter
+from disco_hw.effects import Effect
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BASE_COUNT, BODY, pose_sensor
-from disco_hw.gap.data.free_runs import read_angles
+from disco_hw.gap.data.free_runs import read_angles, rotated
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.data.timing import pose_delay_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
@@ -78,21 +78,17 @@ def _spot(found: ChannelResult, name: str) -> BlindSpot:
     return BlindSpot(name, parameter.name, parameter.unit, size, is_blind(name, size), experiment_of(name))
 
 
-def is_blind(name: str, size: float | None) -> bool:
-    """Whether realistic sizes stay hidden where this is the smallest visible one; of a limit, the largest."""
-    effect = REGISTRY[name]
-    realistic = _realistic(next((p for p in effect.parameters if p.realistic is not None), effect.parameters[0]))
-    if effect.is_limit:
-        return size is None or (size < realistic < math.inf)
-    return size is None or size > realistic
+def is_blind(name: str, size: float | None, possible: float = math.inf) -> bool:
+    """Whether realistic sizes stay hidden where this is the smallest visible one; of a limit, the largest.
 
-
-def _realistic(parameter: Parameter) -> float:
-    """Return the size of a parameter that real robots show; infinity if none is known.
-
-    A log is blind to an effect that is visible above that size only, or to a limit that is visible below it only.
+    A log is blind to an effect that is visible only above the size that real robots show. It is blind to a limit that
+    is visible only below that size and below what is `possible` for the robot.
     """
-    return math.inf if parameter.realistic is None else parameter.realistic
+    effect = REGISTRY[name]
+    realistic = next((p.realistic for p in effect.parameters if p.realistic is not None), math.inf)
+    if effect.is_limit:
+        return size is None or (size < min(realistic, possible) < math.inf)
+    return size is None or size > realistic
 
 
 def experiment_of(name: str) -> str:
@@ -113,8 +109,7 @@ def _limit(found: ChannelResult, name: str, top_rad_s: float | None) -> BlindSpo
             possible = channel.settings.report.limit_share * float(
                 effect.limited(np.array([[-top_rad_s, top_rad_s]]), geometry)[0]
             )
-    enough = min(possible, _realistic(parameter))
-    blind = largest is None or (largest < enough < math.inf)
+    blind = is_blind(name, largest, possible)
     return BlindSpot(name, parameter.name, parameter.unit, largest, blind, experiment_of(name))
 
 
@@ -130,25 +125,34 @@ def _largest(
 
 
 def _largest_tried(found: ChannelResult, effect: Effect) -> float | None:
-    """Return the largest of a limit's trial values that this log would have shown, or None.
-
-    Parameters of the fit and the delays of the wheels may adapt, as they may hide the limit.
-    """
+    """Largest of a limit's trial values that this log shows though other parameters and delays adapt; None if none."""
     channel, best = found.selector.channel, found.fit
-    layout, limits = channel.layout, found.selector.thresholds
+    layout = channel.layout
     places = tuple(
         layout.place[name] for name in DELAY_COLUMNS if name in layout.place and layout.place[name] not in best.active
     )
     slope = np.column_stack([best.jacobian, sensitivity(channel, best.vector, places, best.residual)])
+    threshold = found.selector.thresholds.score + math.log(max(channel.count, 2))
+    return _first_shown(found, effect.columns[0], effect.trials, threshold, slope)
+
+
+def _first_shown(
+    found: ChannelResult, column: str, trials: Iterable[float], threshold: float, slope: Array | None = None
+) -> float | None:
+    """First of the trial values whose prediction differs from the one without clearly, and enough to matter.
+
+    `slope` (n, k): derivatives with respect to what may adapt meanwhile.
+    """
+    channel, best = found.selector.channel, found.fit
     vector = best.vector.copy()
-    for limit in effect.trials:
-        vector[layout.place[effect.columns[0]]] = limit
+    for value in trials:
+        vector[channel.layout.place[column]] = value
         moved = channel.residual(vector) - best.residual
-        residual = moved - slope @ solve(slope, slope.T @ moved)
-        enough = (limits.score + math.log(max(channel.count, 2))) * channel.settings.noise.poor_fit
-        ahead_m = found.selector.moves(channel.split(best.vector), channel.split(vector))
-        if float(residual @ residual) > enough and ahead_m > limits.moves_m:
-            return limit
+        left = moved if slope is None else moved - slope @ solve(slope, slope.T @ moved)
+        if float(left @ left) <= threshold * channel.settings.noise.poor_fit:
+            continue
+        if found.selector.moves(channel.split(best.vector), channel.split(vector)) > found.selector.thresholds.moves_m:
+            return value
     return None
 
 
@@ -161,7 +165,7 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     layout, candidate, limits = channel.layout, CANDIDATES[name], found.selector.thresholds
     threshold = limits.score + candidate.parameters * math.log(max(channel.count, 2))
     if candidate.profile is not None and column == candidate.profile.column:
-        return _by_trial(found, column, REGISTRY[name].trials, threshold)
+        return _first_shown(found, column, REGISTRY[name].trials, threshold)
     vector = best.vector.copy()
     if candidate.profile is not None:
         values = candidate.profile.values(channel)
@@ -189,23 +193,6 @@ def _size(found: ChannelResult, name: str, column: str) -> float | None:
     return size if size < limit else None
 
 
-def _by_trial(found: ChannelResult, column: str, trials: tuple[float, ...], threshold: float) -> float | None:
-    """Smallest of a row of sizes whose prediction differs from the one without clearly, and enough to matter."""
-    channel, best = found.selector.channel, found.fit
-    place = channel.layout.place[column]
-    for size in trials:
-        vector = best.vector.copy()
-        vector[place] = size
-        difference = channel.residual(vector) - best.residual
-        enough = found.selector.moves(channel.split(best.vector), channel.split(vector))
-        if (
-            float(difference @ difference) > threshold * channel.settings.noise.poor_fit
-            and enough > found.selector.thresholds.moves_m
-        ):
-            return size
-    return None
-
-
 # Whether a search names an effect that was put into the log at a size.
 Finds = Callable[[BlindSpot, float], bool]
 
@@ -214,10 +201,7 @@ _BOLDEST = 10.0
 
 
 def boldest_claims(spots: Iterable[BlindSpot], most: int) -> tuple[BlindSpot, ...]:
-    """Return the claims, `most` at most, whose visible sizes are furthest below those that real robots show.
-
-    Effects that equal another one algebraically are left out.
-    """
+    """Return the `most` claims furthest below what real robots show, but for effects that equal another by algebra."""
     claims = [spot for spot in spots if spot.smallest_visible is not None and not spot.blind and _boldness(spot)]
     claims = [spot for spot in claims if REGISTRY[spot.name].mimics is None]
     return tuple(sorted(claims, key=_boldness, reverse=True)[:most])
@@ -396,11 +380,11 @@ def _moved(
     old, new = pose_sensor(now[0]), pose_sensor(then[0])
     measured = drive.pose_values
     turned = after[:, 2] - before[:, 2]
-    step = _rotated(np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2]), _earlier(turned))
+    step = rotated(np.diff(measured[:, :2], axis=0, prepend=measured[:1, :2]), _earlier(turned))
     residual = [
-        _rotated(np.diff(path[:, :2], axis=0, prepend=path[:1, :2]), -_earlier(path[:, 2])) for path in (before, after)
+        rotated(np.diff(path[:, :2], axis=0, prepend=path[:1, :2]), -_earlier(path[:, 2])) for path in (before, after)
     ]
-    step += _rotated(residual[1] - residual[0], _earlier(measured[:, 2] - old.bias_rad + turned))
+    step += rotated(residual[1] - residual[0], _earlier(measured[:, 2] - old.bias_rad + turned))
     # A drift of the world's has its directions, not the robot's.
     ground = channel.carried(then[0]) - channel.carried(now[0])
     seen = np.column_stack([np.interp(drive.pose.t_s, drive.t_s, ground[:, axis]) for axis in (0, 1)])
@@ -426,8 +410,3 @@ def _path(drive: GriddedDrive, channel: BodyChannel, vector: Array, extra: Array
 def _earlier(values: Array) -> Array:
     """Return the predecessor of each value; the first value is its own predecessor."""
     return np.concatenate([values[:1], values[:-1]])
-
-
-def _rotated(step: Array, angle: Array) -> Array:
-    cosine, sine = np.cos(angle), np.sin(angle)
-    return np.column_stack([cosine * step[:, 0] - sine * step[:, 1], sine * step[:, 0] + cosine * step[:, 1]])

@@ -6,8 +6,7 @@ They are found in what the final fit leaves, and change no fit.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -42,10 +41,6 @@ class RareEvent:
     def describe(self) -> str:
         """Describe when the event began and what happened."""
         return f"at {self.begin_s:.1f} s {self.text}"
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the event as it stands in report.json."""
-        return asdict(self)
 
 
 def rare_events(channels: Sequence[ChannelResult]) -> tuple[RareEvent, ...]:

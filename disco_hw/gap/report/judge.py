@@ -30,7 +30,7 @@ from disco_hw.gap.report.misspecification import (
     remaining_disagreements,
 )
 from disco_hw.gap.search import of_every_log
-from disco_hw.gap.search.analysis import ASYMMETRY, ENCODER, GAIN, OUTSIDE_TESTS, FinalFit, GapAnalysis, confounded_with
+from disco_hw.gap.search.analysis import ASYMMETRY, ENCODER, GAIN, FinalFit, GapAnalysis, confounded_with
 from disco_hw.gap.search.channel_result import (
     ChannelEstimates,
     ChannelResult,
@@ -68,7 +68,9 @@ def effect_findings(analysis: GapAnalysis, final: FinalFit, given: bool = False)
 
 def _finding(name: str, found: ChannelResult, estimated: ChannelEstimates, same: tuple[str, ...]) -> EffectFinding:
     values = {parameter.name: estimated.by_name[f"{name}.{parameter.name}"] for parameter in REGISTRY[name].parameters}
-    test = next((text for members, text in OUTSIDE_TESTS.items() if {name, *same} <= members and same), None)
+    mimicked = REGISTRY[same[0]].mimics if len(same) == 1 else None
+    # What decides between the two lies outside such logs.
+    test = None if mimicked is None else mimicked.decided_by
     rivals = tuple(other for other in found.selector.rivals(found.names, name) if other not in same)
     if rivals:
         test = "; ".join([*([test] if test else []), experiment_of(name)])

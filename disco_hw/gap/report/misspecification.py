@@ -18,7 +18,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.gap.data.gridded_drive import GriddedDrive, GridSamples
+from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise import largest_command_jitter_s
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.channel_result import ChannelResult
@@ -86,7 +86,7 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
     size = max((each for each in sizes if math.isfinite(each)), default=math.inf)
     samples = found.channel.samples
     width = best.residual.size // samples.node.size
-    inside = {regime: np.repeat(mask, width) for regime, mask in masks(drive, samples).items()}
+    inside = {regime: np.repeat(mask[samples.node], width) for regime, mask in masks(drive).items()}
     clearest: tuple[float, str] = (settings.form_apart_sigmas, "")
     for column, (one, other) in product(columns, _OPPOSITES):
         place, value = best.active.index(layout.place[column]), float(best.vector[layout.place[column]])
@@ -103,10 +103,7 @@ def _changes_with_regime(found: ChannelResult, name: str) -> str | None:
 def _apart(
     best: Fit, block: Index, place: int, inside: tuple[Mask, Mask], settings: GapSettings
 ) -> tuple[float, float, float] | None:
-    """Return the change of an active entry in each of two regimes, and their difference in standard deviations.
-
-    All other entries are fitted with it. None if either regime says little of it.
-    """
+    """Change of an active entry in each of two regimes, all fitted with it, and their difference in sigmas; or None."""
     slope = best.jacobian[:, place]
     column = float(slope @ slope)
     parts = np.column_stack([np.where(mask, slope, 0.0) for mask in inside])
@@ -135,12 +132,7 @@ class Regime:
     samples: int
 
 
-def masks(drive: GriddedDrive, samples: GridSamples) -> Mapping[str, Mask]:
-    """Which samples lie in which regime; regimes overlap."""
-    return {name: mask[samples.node] for name, mask in masks_at_nodes(drive).items()}
-
-
-def masks_at_nodes(drive: GriddedDrive) -> Mapping[str, Mask]:
+def masks(drive: GriddedDrive) -> Mapping[str, Mask]:
     """Which nodes (M,) lie in which regime; regimes overlap."""
     speed, settings = drive.speed_rad_s, drive.settings.report
     span = drive.settings.terms.smooth_nodes
@@ -190,8 +182,8 @@ def regimes(
     first = (channel.whitened(before) ** 2).mean(axis=1)
     last = (channel.whitened(after, extra) ** 2).mean(axis=1)
     found = []
-    for name, mask in masks(channel.drive, samples).items():
-        inside = mask & use
+    for name, mask in masks(channel.drive).items():
+        inside = mask[samples.node] & use
         if inside.sum() >= channel.settings.grid.fewest_samples:
             found.append(Regime(name, float(first[inside].mean()), float(last[inside].mean()), int(inside.sum())))
     return sorted(found, key=lambda regime: -(regime.before - regime.after) * regime.samples**0.5)
@@ -209,8 +201,7 @@ def describe(found: list[Regime], excess: float) -> str:
 def remaining_disagreements(found: ChannelResult) -> list[str]:
     """Sentences on what a channel's accepted set leaves, the loudest regime first; none where nothing is left."""
     channel = found.channel
-    is_wheels = isinstance(channel, WheelChannel)
-    name = "command_to_wheel" if is_wheels else "wheel_to_body"
+    name = "command_to_wheel" if isinstance(channel, WheelChannel) else "wheel_to_body"
     out = [f"{name}: {regime} still disagrees: {times:.1f} times the noise" for times, regime in loud_regimes(found)]
     if isinstance(channel, WheelChannel):
         drive = channel.drive
@@ -236,8 +227,8 @@ def loud_regimes(found: ChannelResult) -> list[tuple[float, str]]:
     # One nat for each parameter is the price of Akaike's criterion.
     price = channel.settings.selection.unnamed_score + found.richest_parameters
     loud, chosen = [], channel.settings.selection
-    for name, mask in masks(channel.drive, samples).items():
-        inside = mask & use
+    for name, mask in masks(channel.drive).items():
+        inside = mask[samples.node] & use
         if name == "standstill" or inside.sum() < channel.settings.grid.fewest_samples:
             continue
         gain, spread = gain_by_block(0.5 * (now - best)[inside], samples.block[inside], chosen.fewest_blocks)

@@ -281,14 +281,7 @@ def _effects(report: GapReport) -> str:
         rows.append(("unnamed", term.channel, _describe(term), f"{term.evidence:.0f}", also, place + test))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
-    head = (
-        "effect",
-        "channel",
-        "parameters with 95 % intervals",
-        "evidence",
-        "confounded with",
-        "what would decide",
-    )
+    head = ("effect", "channel", "parameters with 95 % intervals", "evidence", "confounded with", "what would decide")
     return _table(head, rows)
 
 

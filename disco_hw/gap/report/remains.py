@@ -42,10 +42,7 @@ class Remains:
     def of(
         cls, timed: PredictionErrors, offered: PredictionErrors, floor: PredictionErrors, body: PredictionErrors | None
     ) -> Remains | None:
-        """Return what remains of the held-out errors, or None if nothing was predicted.
-
-        `body`: the errors of predictions from measured wheel motion.
-        """
+        """Return what remains of errors; None if nothing was predicted. `body`: those from measured wheel motion."""
         if not math.isfinite(offered.position_m):
             return None
         before, after, noise = ((one.position_m, one.yaw_rad) for one in (timed, offered, floor))

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from disco_hw.gap.data.free_runs import rotated
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.channel_result import ChannelResult
 
@@ -80,14 +81,9 @@ class _Path:
         predicted, measured = (values[end] - values[begin] for values in (self.predicted, self.measured))
         if self.heading is not None:
             middle = 0.5 * (self.heading[begin] + self.heading[end])
-            predicted, measured = _in_robot_frame(predicted, middle), _in_robot_frame(measured, middle)
+            for moved in (predicted, measured):
+                moved[:, :2] = rotated(moved[:, :2], -middle)
         return t_s[begin], t_s[end], measured - predicted, predicted
-
-
-def _in_robot_frame(moved: Array, heading: Array) -> Array:
-    cosine, sine = np.cos(heading), np.sin(heading)
-    ahead, left = cosine * moved[:, 0] + sine * moved[:, 1], cosine * moved[:, 1] - sine * moved[:, 0]
-    return np.column_stack([ahead, left, moved[:, 2]])
 
 
 def scan(found: ChannelResult, channels: int) -> list[Windows]:

@@ -18,14 +18,7 @@ from disco_hw.effects import Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.noise import sensor_noise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
-from disco_hw.gap.search.analysis import (
-    GAIN,
-    FinalFit,
-    GapAnalysis,
-    final_fit,
-    lacking,
-    least_evident_first,
-)
+from disco_hw.gap.search.analysis import GAIN, FinalFit, GapAnalysis, final_fit, lacking, least_evident_first
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.cross_validation import (
     Chain,
@@ -112,11 +105,11 @@ class _Fitted:
     folds: Mapping[int, JointFit]
 
     @classmethod
-    def to(cls, ahead: Ahead, of: Freed, folds: Mapping[int, Freed] | None = None) -> _Fitted:
-        """Fit all data, and each of the `folds` from where it begins; without them, from the fit of all data."""
+    def to(cls, ahead: Ahead, of: Freed) -> _Fitted:
+        """Fit all data, and from there the data without each fold."""
         joint = ahead.fit(of)
-        begin = dict.fromkeys(range(ahead.folds), of.at(joint.vectors)) if folds is None else folds
-        return cls(of, joint, {fold: ahead.fit(start, fold) for fold, start in begin.items()})
+        start = of.at(joint.vectors)
+        return cls(of, joint, {fold: ahead.fit(start, fold) for fold in range(ahead.folds)})
 
     def at(self, fold: int | None = None) -> Freed:
         """Return the freed entries around the fit to all data, or to those without one fold."""

@@ -6,9 +6,7 @@ without one of the names.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,11 +58,6 @@ ENCODER, _SHOWN = next((name, one) for name, one in _MIMICS.items() if one.seen_
 GAIN = _SHOWN.effect.name
 ASYMMETRY = _SHOWN.seen_too_as.EFFECT.name
 ASYMMETRY_COLUMN = REGISTRY[ASYMMETRY].columns[0]
-
-# What decides between the members of a class lies outside such logs.
-OUTSIDE_TESTS: Mapping[frozenset[str], str] = MappingProxyType(
-    {frozenset((name, mimicked.effect.name)): mimicked.decided_by for name, mimicked in _MIMICS.items()}
-)
 
 
 def one_encoder(
@@ -222,15 +215,10 @@ def least_evident_first(analysis: GapAnalysis) -> list[tuple[str, str | None]]:
 def lacking(analysis: GapAnalysis, which: str, name: str | None) -> GapAnalysis:
     """Return the analysis without one effect of a channel, or without its unnamed terms if `name` is None."""
     found: ChannelResult = getattr(analysis, which)
-    if name is not None:
-        rest = tuple(other for other in found.names if other != name)
-        return _changed(analysis, found, replace(found, names=rest), (name,))
-    bare = replace(found, selector=found.plain or found.selector, unnamed=(), plain=None)
-    return _changed(analysis, found, bare, tuple(term.form for term in found.unnamed))
-
-
-def _changed(analysis: GapAnalysis, old: ChannelResult, new: ChannelResult, left_out: tuple[str, ...]) -> GapAnalysis:
-    left_out = (*analysis.left_out, *left_out)
-    if old is analysis.wheels:
-        return replace(analysis, wheels=new, left_out=left_out)
-    return replace(analysis, body=new, left_out=left_out)
+    if name is None:
+        left_out = tuple(term.form for term in found.unnamed)
+        fewer = replace(found, selector=found.plain or found.selector, unnamed=(), plain=None)
+    else:
+        left_out, fewer = (name,), replace(found, names=tuple(other for other in found.names if other != name))
+    analysis = replace(analysis, left_out=(*analysis.left_out, *left_out))
+    return replace(analysis, wheels=fewer) if which == "wheels" else replace(analysis, body=fewer)

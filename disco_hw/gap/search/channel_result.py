@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from disco_hw.effects import Stage
 from disco_hw.effects.registry import in_stages
-from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.evidence import Z95, EffectEvidence, inflation, interval_inflation
 from disco_hw.gap.search.least_squares import Fit, by_block, fit, inverse, sensitivity, within
 from disco_hw.gap.search.richest_model import CANDIDATES, delay_columns, indices
 from disco_hw.gap.search.selection import Names, Selector
-from disco_hw.gap.search.unnamed_terms import Term, WithTerms
+from disco_hw.gap.search.unnamed_terms import ResidualChannel, Term, WithTerms
 
 Array = NDArray[np.float64]
 
@@ -60,8 +60,17 @@ class ChannelResult:
 
     @cached_property
     def evenly(self) -> Fit | None:
-        """The accepted set as it fits errors that are alike at every speed; None where there are no other weights."""
-        return _evenly(self)
+        """The accepted set as it fits wheel errors alike at every speed; None for the body, or if nothing is free."""
+        best, channel = self.fit, self.channel
+        if not isinstance(channel, WheelChannel) or not best.active:
+            return None
+        terms, vector = tuple(one.term for one in self.unnamed), best.vector
+        for _ in range(channel.settings.fit.rounds):
+            plainly = channel.evenly(*self.selector.channel.split(vector))
+            even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
+            other = fit(even, vector, best.active)
+            vector = other.vector
+        return other
 
     @cached_property
     def reported(self) -> Fit:
@@ -73,20 +82,6 @@ class ChannelResult:
         """The fit without anything that is missing."""
         selector = self.plain or self.selector
         return selector.exact(selector.given)
-
-
-def _evenly(found: ChannelResult) -> Fit | None:
-    """Fit the accepted set with wheel errors alike at every speed; None for the body or without free parameters."""
-    best, channel = found.fit, found.channel
-    if not isinstance(channel, WheelChannel) or not best.active:
-        return None
-    terms, vector = tuple(one.term for one in found.unnamed), best.vector
-    for _ in range(channel.settings.fit.rounds):
-        plainly = channel.evenly(*found.selector.channel.split(vector))
-        even: ResidualChannel = WithTerms.of(plainly, terms) if terms else plainly
-        other = fit(even, vector, best.active)
-        vector = other.vector
-    return other
 
 
 def _reported_fit(found: ChannelResult) -> Fit:

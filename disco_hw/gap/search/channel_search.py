@@ -15,7 +15,7 @@ from disco_hw.gap.data import BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise
 from disco_hw.gap.noise.body_noise import BodyNoise
-from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
 from disco_hw.gap.search.evidence import compare
@@ -34,7 +34,15 @@ from disco_hw.gap.search.richest_model import (
     with_delay,
 )
 from disco_hw.gap.search.selection import Names, Selector, Thresholds, body_moves, wheel_moves
-from disco_hw.gap.search.unnamed_terms import Term, WithTerms, body_terms, places, places_near, wheel_terms
+from disco_hw.gap.search.unnamed_terms import (
+    ResidualChannel,
+    Term,
+    WithTerms,
+    body_terms,
+    places,
+    places_near,
+    wheel_terms,
+)
 from disco_hw.gap.settings import SelectionSettings
 
 # Fourth moment of normal noise over its variance squared.
@@ -234,11 +242,10 @@ def _thresholds(white: Array, use: NDArray[np.bool_], settings: SelectionSetting
     """
     sound = white[use]
     sound = sound[np.abs(sound).max(axis=1) > settings.silent]
-    if not sound.size:
-        return Thresholds(settings.named_score, settings.least_moved_m, settings.unnamed_score)
-    sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
-    heavy = float((sound**4).mean()) / _GAUSSIAN_KURTOSIS
-    times = min(max(heavy, 1.0), settings.heaviest)
+    times = 1.0
+    if sound.size:
+        sound = np.clip(sound / np.sqrt((sound**2).mean()), -settings.clipped_at, settings.clipped_at)
+        times = min(max(float((sound**4).mean()) / _GAUSSIAN_KURTOSIS, 1.0), settings.heaviest)
     return Thresholds(times * settings.named_score, settings.least_moved_m, times * settings.unnamed_score)
 
 

@@ -15,7 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from disco_hw.gap.data import BASE_COUNT, ENCODER_COLUMNS
-from disco_hw.gap.data.free_runs import displacement, read_angles, run_body, starts_of
+from disco_hw.gap.data.free_runs import displacement, read_angles, rotated, run_body, starts_of
 from disco_hw.gap.noise import SensorNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel, total_perturbation
 from disco_hw.gap.search.analysis import GapAnalysis
@@ -80,6 +80,11 @@ class Starts:
     end: Array
     block: Index
     regime: tuple[str, ...]
+
+    @property
+    def way(self) -> Array:
+        """Measured displacements (K, 2) in the frame of the start: forward, left."""
+        return rotated(self.end[:, :2] - self.pose[:, :2], -self.pose[:, 2])
 
 
 @dataclass(frozen=True)
@@ -199,10 +204,7 @@ def chain_wheels(body: BodyChannel, wheels: WheelChannel | None, chain: Chain) -
 def chain_track(
     body: BodyChannel, wheels: WheelChannel | None, chain: Chain, turned: tuple[Array, Array] | None = None
 ) -> tuple[Array, Array]:
-    """Free run from commands to the path (M, 3), and wheel speeds (M, 2) on the way.
-
-    `turned`: what `chain_wheels` gives, if that is known.
-    """
+    """Path (M, 3) of a free run and its wheel speeds (M, 2); `turned`: what `chain_wheels` gives, if that is known."""
     drive = body.drive
     p = chain.body.copy()
     angle, speed = chain_wheels(body, wheels, chain) if turned is None else turned
@@ -223,11 +225,9 @@ def prediction_error(body: BodyChannel, starts: Starts, p: Array, track: Array, 
 
 def displacement_error(starts: Starts, moved: Array) -> Array:
     """Measured minus predicted displacement (K, 3) of any predictor, in the frame of the start: forward, left, yaw."""
-    dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
-    cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
     yaw = starts.end[:, 2] - starts.pose[:, 2] - moved[:, 2]
     yaw = np.mod(yaw + np.pi, 2.0 * np.pi) - np.pi
-    return np.column_stack([cosine * dx + sine * dy - moved[:, 0], -sine * dx + cosine * dy - moved[:, 1], yaw])
+    return np.column_stack([starts.way - moved[:, :2], yaw])
 
 
 def fold_of(channel: BodyChannel | WheelChannel) -> Index:
@@ -264,11 +264,7 @@ def fold_vectors(found: Fit, fold: Index, count: int, neutral: Array, settings: 
 
 
 def errors_of(
-    body: BodyChannel,
-    wheels: WheelChannel | None,
-    chains: dict[int, Chain],
-    ahead_s: float,
-    poses: tuple[Array, Array],
+    body: BodyChannel, wheels: WheelChannel | None, chains: dict[int, Chain], ahead_s: float, poses: tuple[Array, Array]
 ) -> PredictionErrors:
     """Errors at one horizon, each start predicted by the chain of its fold."""
     starts = find_starts(body, poses, ahead_s)
@@ -323,12 +319,9 @@ def floor_errors(body: BodyChannel, noise: SensorNoise, ahead_s: float, poses: t
     # The start is a mean over all poses within reach, the end a single one.
     averaged = max(2.0 * settings.pose_reach_s / period_s, 1.0)
     size = np.array([noise.position_m, noise.position_m, noise.yaw_rad])
-    cosine, sine = np.cos(starts.pose[:, 2]), np.sin(starts.pose[:, 2])
-    dx, dy = starts.end[:, 0] - starts.pose[:, 0], starts.end[:, 1] - starts.pose[:, 1]
-    ahead, left = cosine * dx + sine * dy, cosine * dy - sine * dx
     squares = np.tile(size**2 * (1.0 + 1.0 / averaged), (starts.node.size, 1))
     # What the heading errs by at the start moves the end aside.
-    squares[:, :2] += np.column_stack([left, ahead]) ** 2 * noise.yaw_rad**2 / averaged
+    squares[:, :2] += starts.way[:, ::-1] ** 2 * noise.yaw_rad**2 / averaged
     return summarise(np.sqrt(squares), np.full(starts.node.size, noise.wheel_rad_s), starts, settings)
 
 
@@ -336,10 +329,7 @@ Angles = dict[int, Array]
 
 
 def only_timed(found: ChannelResult) -> ChannelResult:
-    """Return the result of the wheels with only a delay and a lag in place of what was found.
-
-    A careful engineer fits the same by hand.
-    """
+    """Return the wheels with only a delay and a lag of what was found: what a careful engineer fits by hand."""
     plain = found.plain or found.selector
     names = tuple(dict.fromkeys((*plain.given, *DELAY_NAMES)))
     selector = replace(plain, fits=dict(plain.fits), proofs={})

@@ -76,10 +76,7 @@ def best_of(options: Sequence[T], errors: Callable[[T], PredictionErrors], floor
 
 
 def first_as_good(
-    options: Sequence[T],
-    errors: Callable[[T], PredictionErrors],
-    floor: PredictionErrors | None,
-    worth: float = 0.0,
+    options: Sequence[T], errors: Callable[[T], PredictionErrors], floor: PredictionErrors | None, worth: float = 0.0
 ) -> T:
     """Return the first of the options, which begin with the simplest, that is as good as the best of them.
 

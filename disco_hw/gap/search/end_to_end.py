@@ -111,10 +111,7 @@ class Ahead:
 
     @classmethod
     def of(cls, body: BodyChannel, wheels: WheelChannel | None, poses: tuple[Array, Array]) -> Ahead:
-        """Build the predictions of a drive from smoothed `poses`, over half and all of the reported horizon.
-
-        Horizons are shorter where runs are.
-        """
+        """Predictions from smoothed `poses` over half and all of the reported horizon, or shorter where runs are."""
         longest_s = scored_horizon_s(body, poses)
         usual_s = body.settings.prediction.reported_horizon_s
         horizons = sorted({min(ahead_s, longest_s) for ahead_s in (0.5 * usual_s, usual_s)})

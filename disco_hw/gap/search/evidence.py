@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from disco_hw.gap.noise.channels import ResidualChannel
 from disco_hw.gap.search.least_squares import Fit, by_block, inverse, known
+from disco_hw.gap.search.unnamed_terms import ResidualChannel
 
 Array = NDArray[np.float64]
 Z95 = 1.96

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data import Layout
-from disco_hw.gap.noise.channels import ResidualChannel
+from disco_hw.gap.search.unnamed_terms import ResidualChannel
 from disco_hw.gap.settings import FitSettings
 
 Array = NDArray[np.float64]
@@ -160,7 +160,8 @@ def fit(
     settings = channel.settings.fit
     for _ in range((settings.iterations if iterations is None else iterations) if active else 0):
         slope = slope() if callable(slope) else slope
-        enough_nats = settings.enough_carried_nats if carried else settings.enough_nats
+        # Derivatives that were taken along make the last steps shorter.
+        enough_nats = 0.1 * settings.enough_nats if carried else settings.enough_nats
         normal, gradient = slope.T @ slope, slope.T @ now
         if has_prior:
             normal, gradient = normal + np.diag(precision), gradient + precision * (vector[chosen] - expected)
@@ -202,19 +203,13 @@ def _as_promised(gained: float, gradient: Array, normal: Array, step: Array, set
 
 
 def _carried(slope: Array, step: Array, change: Array, scale: Array) -> Array:
-    """Update derivatives (n, A) by a rank-one term, so that a step (A,) gives the `change` (n,) of residuals.
-
-    Along directions orthogonal to the scaled step they stay as they were (Broyden, 1965).
-    """
+    """Change derivatives (n, A) least, so that a step (A,) gives the `change` (n,) of residuals (Broyden, 1965)."""
     along = scale * step
     return np.asarray(slope + np.outer(change - slope @ step, along / float(along @ step)))
 
 
 def by_block(found: Fit, block: Index, blocks_each: int = 1) -> tuple[Array, Array]:
-    """Return normal matrices (B, A, A) and gradients (B, A) by block of time.
-
-    `blocks_each` neighbouring blocks count as one.
-    """
+    """Return normal matrices (B, A, A) and gradients (B, A) by block; `blocks_each` neighbours count as one."""
     label = np.unique(block // blocks_each, return_inverse=True)[1]
     sizes, width = np.bincount(label), len(found.active)
     normal, gradient = np.zeros((sizes.size, width, width)), np.zeros((sizes.size, width))

@@ -20,9 +20,10 @@ from disco_hw.effects.registry import REGISTRY, in_stages
 from disco_hw.gap.data import DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise import learn_body_noise, learn_wheel_noise, wheel_mismatch
-from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise, whiten_wheels
 from disco_hw.gap.search.least_squares import sensitivity
+from disco_hw.gap.search.unnamed_terms import ResidualChannel
 from disco_hw.gap.settings import GRID_STEP_S, FitSettings
 from disco_hw.jit import kernel_function
 
@@ -241,34 +242,30 @@ def _delay_starts(channel: ResidualChannel, starts: Starts) -> Starts:
     return tuple((start + channel.inner.drive.commands_moved_s, *rest) for start, *rest in starts)
 
 
-def _candidate(effect: Effect) -> Candidate:
-    scan, begin = effect.scan, effect.starts
-    fitted = [p.name for p in effect.parameters if scan is None or p.name != scan.parameter]
+def _starts(effect: Effect) -> Callable[[ResidualChannel], Starts] | None:
+    begin = effect.starts
     if effect.stage is Stage.POSE_TIME:
-        return Candidate(effect.name, tuple(f"{effect.name}.{key}" for key in fitted), _pose_starts)
-    if effect.stage is Stage.DELAY and begin is not None:
-        return Candidate(
-            effect.name,
-            tuple(f"{effect.name}.{key}" for key in fitted),
-            lambda channel: _delay_starts(channel, begin(driven(channel))),
-        )
-    return Candidate(
-        effect.name,
-        tuple(f"{effect.name}.{key}" for key in fitted),
-        None if begin is None else lambda channel: begin(driven(channel)),
-        None
-        if scan is None
-        else Profile(f"{effect.name}.{scan.parameter}", lambda channel: scan.values(driven(channel)), scan.refine),
-        effect.like_a_patch is not None,
-    )
+        return _pose_starts
+    if begin is None:
+        return None
+    if effect.stage is Stage.DELAY:
+        return lambda channel: _delay_starts(channel, begin(driven(channel)))
+    return lambda channel: begin(driven(channel))
 
 
-def _competing() -> dict[str, Candidate]:
-    # What mimics another effect is decided after the others, in `analysis`.
-    return {name: _candidate(effect) for name, effect in REGISTRY.items() if effect.mimics is None}
+def _candidate(effect: Effect) -> Candidate:
+    scan, profile = effect.scan, None
+    if scan is not None:
+        column = f"{effect.name}.{scan.parameter}"
+        profile = Profile(column, lambda channel: scan.values(driven(channel)), scan.refine)
+    columns = tuple(column for column in effect.columns if profile is None or column != profile.column)
+    return Candidate(effect.name, columns, _starts(effect), profile, effect.like_a_patch is not None)
 
 
-CANDIDATES: Mapping[str, Candidate] = MappingProxyType(_competing())
+# What mimics another effect is decided after the others, in `analysis`.
+CANDIDATES: Mapping[str, Candidate] = MappingProxyType(
+    {name: _candidate(effect) for name, effect in REGISTRY.items() if effect.mimics is None}
+)
 
 
 def candidates_of(layout: Layout) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as
-from disco_hw.gap.noise.channels import BodyChannel, ResidualChannel, WheelChannel
+from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.search.evidence import EffectEvidence, compare
 from disco_hw.gap.search.least_squares import Fit, fit, inverse, sensitivity
 from disco_hw.gap.search.richest_model import (
@@ -21,6 +21,7 @@ from disco_hw.gap.search.richest_model import (
     indices,
     parameters_of,
 )
+from disco_hw.gap.search.unnamed_terms import ResidualChannel
 from disco_hw.gap.settings import GRID_STEP_S, SelectionSettings
 
 Array = NDArray[np.float64]
@@ -167,16 +168,12 @@ class Selector:
             return fit(self.channel, parent, active, loose=not self.closely)
         gains = {value: self._linear_gain(parent, new, value) for value in values}
         spacing = values[1] - values[0]
-
-        def closer(gain_at: Callable[[float], float], spacing: float) -> None:
-            while spacing > new.profile.refine:  # type: ignore[union-attr]
-                spacing *= 0.5
-                best = max(gains, key=gains.__getitem__)
-                for value in (best - spacing, best + spacing):
-                    if value not in gains:
-                        gains[value] = gain_at(value)
-
-        closer(lambda value: self._linear_gain(parent, new, value), spacing)
+        while spacing > new.profile.refine:
+            spacing *= 0.5
+            best = max(gains, key=gains.__getitem__)
+            for value in (best - spacing, best + spacing):
+                if value not in gains:
+                    gains[value] = self._linear_gain(parent, new, value)
         best = max(gains, key=gains.__getitem__)
         found = self._at(parent, active, new, best)
         if 2.0 * (parent.cost - found.cost) < self.thresholds.score:
@@ -328,10 +325,7 @@ class Selector:
         return float(self.fit(names).cost + 0.5 * parameters_of(names) * np.log(self.channel.count))
 
     def swapped(self, accepted: Names, among: Names | None = None) -> Names:
-        """Replace single effects by others as long as that gains more than the price of the parameters.
-
-        `among` limits which effects are replaced, and by which.
-        """
+        """Replace effects by others, both `among` some, as long as that gains more than the price of the parameters."""
         for _ in range(len(accepted)):
             best, score = accepted, self.settings.telling_nats
             for place, old in enumerate(accepted):
@@ -363,10 +357,7 @@ class Selector:
         return float(self.fit(rest).cost - self.fit(accepted).cost - price)
 
     def needed(self, accepted: Names, among: Names | None = None) -> Names:
-        """Drop effects that the others have made unnecessary, the one that is missed least first.
-
-        `among` limits which effects may be dropped.
-        """
+        """Drop effects, `among` some, that the others have made unnecessary, the one that is missed least first."""
         idle = []
         for name in accepted:
             if name in self.given or (among is not None and name not in among):

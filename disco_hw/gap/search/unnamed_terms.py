@@ -61,10 +61,7 @@ class Term:
         return (self.perturbation, *self.further_waves)
 
     def written(self, coefficients: Array) -> str:
-        """Format the equation with its coefficient, or for waves with the root mean square of their sum.
-
-        `coefficients`: one per feature.
-        """
+        """Format the equation with its coefficients: one, or of waves the root mean square of their sum."""
         size = float(coefficients[0]) if not self.further_waves else float(np.sqrt(0.5 * (coefficients**2).sum()))
         return self.form.format(size)
 
@@ -146,25 +143,22 @@ def _waves(drive: GriddedDrive, v: Array, w: Array) -> Iterator[Term]:
 def with_known_terms(drive: GriddedDrive, effects: Iterable[EffectSetting], p: Array, delay_s: float) -> GriddedDrive:
     """Return the drive with what the terms among `effects` add; `p` is the parameter vector of the body."""
     u, (v, w, a) = drive.delayed_commands(delay_s), motion(drive, p)
-    command = motion_perturbation = None
+    of_commands: list[Array] = []
+    of_motion: list[Array] = []
     for setting in effects:
         term = TERMS.get(setting.name)
         if term is None:
             continue
-        if term.target == COMMAND:
-            perturbation = _times(setting, _of_commands(term, u, drive.t_s))
-            command = perturbation if command is None else command + perturbation
+        is_of_commands = term.target == COMMAND
+        feature = _of_commands(term, u, drive.t_s) if is_of_commands else _of_body(term, v, w, a, drive.t_s)
+        reach = setting.values[REACH.name]
+        added = setting.values["k"] * np.clip(feature, -reach, reach)
+        if is_of_commands:
+            of_commands.append(added)
         else:
-            perturbation = _times(setting, _of_body(term, v, w, a, drive.t_s))
-            perturbation = _on(BODY_TARGETS.index(term.target), perturbation)
-            motion_perturbation = perturbation if motion_perturbation is None else motion_perturbation + perturbation
-    return replace(drive, known_command=command, known_motion=motion_perturbation)
-
-
-def _times(setting: EffectSetting, feature: Array) -> Array:
-    """Return the contribution of a model's term for a feature at the nodes."""
-    reach = setting.values[REACH.name]
-    return np.asarray(setting.values["k"] * np.clip(feature, -reach, reach))
+            of_motion.append(_on(BODY_TARGETS.index(term.target), added))
+    command, moved = (sum(each[1:], each[0]) if each else None for each in (of_commands, of_motion))
+    return replace(drive, known_command=command, known_motion=moved)
 
 
 def _of_commands(term: GenericTerm, u: Array, t_s: Array) -> Array:
@@ -250,11 +244,20 @@ def smoothed(values: Array, settings: TermSettings) -> Array:
 
 @dataclass(frozen=True)
 class WithTerms:
-    """A channel with unnamed terms, whose coefficients are further entries of the parameter vector, always free."""
+    """The channel `inner` with unnamed terms, whose coefficients are further entries of the vector, always free.
+
+    The other fields are those of `inner`, and wider where they speak of the vector.
+    """
 
     inner: WheelChannel | BodyChannel
     terms: tuple[Term, ...]
     layout: Layout
+    neutral: Array
+    free: tuple[int, ...]
+    settings: GapSettings
+    block: Index
+    count: int
+    trusted_blocks: float
     # What the terms add with the coefficients that were asked for last.
     kept: dict[bytes, Array] = field(default_factory=dict, repr=False, compare=False)
 
@@ -270,54 +273,19 @@ class WithTerms:
         features = [feature for term in terms for feature in term.features]
         sizes = [max(float(np.sqrt((feature**2).mean())), 1e-12) for feature in features]
         usual = np.array([term.usual for term in terms for _ in term.features])
-        count = len(features)
+        first, none = len(plain.columns), np.zeros(len(features))
         layout = replace(
             plain,
             columns=plain.columns + names,
-            neutral=np.append(plain.neutral, np.zeros(count)),
+            neutral=np.append(plain.neutral, none),
             step=np.append(plain.step, [1e-3 / size for size in sizes]),
-            low=np.append(plain.low, np.full(count, -math.inf)),
+            low=np.append(plain.low, none - math.inf),
             high=np.append(plain.high, [term.highest for term in terms for _ in term.features]),
             precision=np.append(plain.precision, usual**-2.0),
-            place={**plain.place, **{name: len(plain.columns) + k for k, name in enumerate(names)}},
+            place={**plain.place, **{name: first + k for k, name in enumerate(names)}},
         )
-        return cls(inner, terms, layout)
-
-    @property
-    def settings(self) -> GapSettings:
-        """The settings of the analysis."""
-        return self.inner.settings
-
-    @property
-    def neutral(self) -> Array:
-        """The vector without any effect or term."""
-        return np.append(self.inner.neutral, np.zeros(self.many))
-
-    @property
-    def many(self) -> int:
-        """Number of coefficients of all terms."""
-        return sum(len(term.features) for term in self.terms)
-
-    @property
-    def free(self) -> tuple[int, ...]:
-        """Entries that are always fitted: the base and the coefficients."""
-        first = len(self.inner.layout.columns)
-        return (*self.inner.free, *range(first, first + self.many))
-
-    @property
-    def block(self) -> Index:
-        """Block of time of each residual."""
-        return self.inner.block
-
-    @property
-    def count(self) -> int:
-        """Number of residuals that are used."""
-        return self.inner.count
-
-    @property
-    def trusted_blocks(self) -> float:
-        """Weight of the noise model, as a number of blocks of time that agree with it."""
-        return self.inner.trusted_blocks
+        neutral, free = np.append(inner.neutral, none), (*inner.free, *range(first, first + none.size))
+        return cls(inner, terms, layout, neutral, free, inner.settings, inner.block, inner.count, inner.trusted_blocks)
 
     def split(self, p: Array) -> tuple[Array, Array | None]:
         """Split a vector into that of the inner channel and what the terms add at the nodes.
@@ -340,3 +308,7 @@ class WithTerms:
         """Return the whitened residuals at a vector."""
         core, perturbation = self.split(p)
         return self.inner.residual(core, perturbation)
+
+
+ResidualChannel = WheelChannel | BodyChannel | WithTerms
+"""A channel as it is fitted: the number of its residuals is n, of which `count` are used, in the time `block` (n,)."""

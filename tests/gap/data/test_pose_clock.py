@@ -371,7 +371,7 @@ def test_too_few_pairs_are_not_fitted(fewest, known):
     count, _ = by_hand(wheels, poses, 0.12)
     settings = replace(SETTINGS, fewest_samples=count + fewest)
     assert np.isfinite(timing._mismatches(wheels, poses, np.array([0.12]), settings))[0] == known
-    pairs = timing._pairs(poses, 0.4)[0].size
+    pairs = timing.apart(poses.t_s, poses.segment, 0.4)[0].size
     for more, wanted in ((0, True), (1, False)):
         settings = replace(SETTINGS, fewest_samples=pairs + more)
         unlimited = replace(wheels, t_s=wheels.t_s.copy(), segment=wheels.segment)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY
-from disco_hw.gap.report.misspecification import Regime, describe, gain_by_block, masks_at_nodes, regimes
+from disco_hw.gap.report.misspecification import Regime, describe, gain_by_block, masks, regimes
 from tests.gap.synthetic import body_channel, line_of
 
 
 def test_nodes_lie_in_the_regimes_that_the_wheels_tell():
     rest, ahead, back, left = [0.0, 0.0], [4.0, 4.0], [-4.0, -4.0], [1.0, 5.0]
-    parts = masks_at_nodes(line_of(np.repeat([rest, ahead, back, left], 300, axis=0)))
+    parts = masks(line_of(np.repeat([rest, ahead, back, left], 300, axis=0)))
     middle = dict(zip(("rest", "ahead", "back", "left"), (150, 450, 750, 1050), strict=True))
     assert {name for name, node in middle.items() if parts["standstill"][node]} == {"rest"}
     assert {name for name, node in middle.items() if parts["driving ahead"][node]} == {"ahead", "left"}
@@ -33,7 +33,7 @@ def test_what_is_driven_at_one_speed_is_neither_slow_nor_fast(other, least, most
     """Noise would tell them apart, and every value that goes with the speed would differ between them."""
     wheels = np.repeat([[2.0, 5.0], [2.0 * other, 5.0 * other]], 300, axis=0)
     noisy = wheels * (1.0 + 0.015 * np.random.default_rng(1).standard_normal(wheels.shape))
-    parts = masks_at_nodes(line_of(noisy))
+    parts = masks(line_of(noisy))
     assert parts["turning left"].all()
     for name in ("turning slowly", "turning fast"):
         assert least <= parts[name].mean() <= most

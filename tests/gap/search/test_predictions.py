@@ -7,6 +7,7 @@ import pytest
 
 from disco_hw.gap.data import WHEEL
 from disco_hw.gap.data.gridded_drive import GridSamples
+from disco_hw.gap.data.stamp_clock import picked
 from disco_hw.gap.noise import SensorNoise
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.cross_validation import (
@@ -93,7 +94,7 @@ def test_poses_at_the_end_of_their_reach_count_and_thin_ones_of_either_side():
 def test_where_no_pose_is_near_there_is_none():
     line = line_of(np.zeros((800, 2)))
     away = (line.pose.t_s > 2.0) & (line.pose.t_s < 3.5)
-    channel = with_poses(line, np.ones((np.count_nonzero(~away), 3)), line.pose.pick(~away))
+    channel = with_poses(line, np.ones((np.count_nonzero(~away), 3)), picked(line.pose, ~away))
     times = channel.samples.t_s
     apart_s = np.abs(line.t_s[:, None] - times).min(axis=1)
     for poses in smoothed_poses(channel, vector_of()):
@@ -268,7 +269,7 @@ def test_the_floor_is_the_noise_of_a_pose_and_of_a_mean_and_a_heading_that_is_of
     if every > 1:
         line = channel.drive
         chosen = np.arange(0, line.pose.t_s.size, every)
-        channel = with_poses(line, line.pose_values[chosen], line.pose.pick(chosen))
+        channel = with_poses(line, line.pose_values[chosen], picked(line.pose, chosen))
     smooth, alone = smoothed_poses(channel, vector_of())
     noise = SensorNoise(0.004, 0.01, 0.05)
     floor = floor_errors(channel, noise, 2.0, (smooth, alone))
@@ -295,7 +296,7 @@ def test_the_floor_is_the_noise_of_a_pose_and_of_a_mean_and_a_heading_that_is_of
 def test_a_heading_that_is_off_at_the_start_moves_the_end_aside_by_the_way(wheels, heading_rad, way_m):
     line = steady(*wheels, seconds=40.0, pose=(0.0, 0.0, heading_rad)).drive
     chosen = np.arange(0, line.pose.t_s.size, 4)
-    channel = with_poses(line, line.pose_values[chosen], line.pose.pick(chosen))
+    channel = with_poses(line, line.pose_values[chosen], picked(line.pose, chosen))
     floor = floor_errors(channel, SensorNoise(1e-9, 0.01, 0.0), 2.0, smoothed_poses(channel, vector_of()))
     # One pose every 0.16 s, of those within 0.3 s either side.
     assert floor.position_m == pytest.approx(way_m * 0.01 / np.sqrt(0.6 / 0.16), rel=0.04)

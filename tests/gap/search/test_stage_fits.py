@@ -176,7 +176,7 @@ def test_lateness_that_is_free_already_is_freed_once_and_without_wheels_none():
     assert _timed(ahead, alone) is alone
 
 
-def test_folds_are_fitted_from_the_fit_of_all_or_from_where_each_begins():
+def test_folds_are_fitted_from_the_fit_of_all():
     ahead = Noted(0.001)
     of = two_parts((LAG,))
     fitted = _Fitted.to(ahead, of)
@@ -185,10 +185,6 @@ def test_folds_are_fitted_from_the_fit_of_all_or_from_where_each_begins():
     # Around the fit of all data, and around those without a fold.
     assert [fitted.at(held).parts[1].vector[LAG] for held in (None, 0, 1)] == pytest.approx([0.001, 0.003, 0.004])
     assert [fitted.chains[held].wheels[LAG] for held in (0, 1)] == pytest.approx([0.003, 0.004])
-    own = {held: of.at([BODY.neutral, WHEEL.neutral + 10.0 * (1 + held)]) for held in (0, 1)}
-    begun = _Fitted.to(ahead, of, own)
-    assert [begun.folds[held].vectors[1][LAG] for held in (0, 1)] == pytest.approx([10.002, 20.003])
-    assert begun.joint.vectors[1][LAG] == pytest.approx(0.001)
 
 
 @pytest.mark.parametrize("best", range(3))

@@ -65,7 +65,7 @@ def test_features_that_belong_together_have_a_coefficient_each_and_pay_for_each(
     channel = WithTerms.of(found.channel, (both, on_turning("{}", rate**3)))
     width = len(found.channel.layout.columns)
     assert channel.layout.columns[width:] == ("term0", "term0.1", "term1")
-    assert channel.many == 3
+    assert channel.neutral.size - channel.inner.neutral.size == 3
     assert channel.layout.precision[width:] == pytest.approx([100.0, 100.0, 0.0])
     _, added = channel.split(np.concatenate([found.channel.neutral, [0.2, -0.1, 0.0]]))
     np.testing.assert_allclose(added[:, 2], rate * (0.2 * half - 0.1 * (1.0 - half)))
