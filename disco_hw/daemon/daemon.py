@@ -188,7 +188,7 @@ class Daemon:
             tick=stats.ticks,
             woke_ns=now_ns,
             lateness_ns=stats.last_lateness_ns,
-            stages_ns=self._loop.stages.last_ns(),
+            stages_ns=self._loop.stages.last_ns,
             overruns=stats.overruns,
             skipped=stats.skipped_periods,
         )
