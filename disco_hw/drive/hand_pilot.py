@@ -40,11 +40,6 @@ class Deadman:
         self._was_armed = False
         self._release_requested = False
 
-    @property
-    def engaged(self) -> bool:
-        """Whether the press that began this stretch of driving still holds."""
-        return self._engaged
-
     def step(self, now_ns: int, newest: ManualInput | None, state: State) -> DeadmanVerdict:
         """Judge the newest input (None: the device is gone) in the daemon's present state."""
         fresh = newest is not None and 0 <= now_ns - newest.t_ns <= INPUT_LIMIT_NS
@@ -106,6 +101,9 @@ _MESSAGES = 5
 class HandPilot:
     """Drives as its source says, while its deadman is held."""
 
+    # The person sees the robot.
+    needs_pose = False
+
     def __init__(self, source: ManualSource, coverage: Coverage, page: PageSource | None = None) -> None:
         """`page` is what hears the page: the source itself, or the deadman of its script."""
         self._source = source
@@ -116,11 +114,6 @@ class HandPilot:
         self._task = ""
         self._pending_messages: deque[str] = deque()
         self._messages: deque[str] = deque(maxlen=_MESSAGES)
-
-    @property
-    def needs_pose(self) -> bool:
-        """The person sees the robot."""
-        return False
 
     @property
     def done(self) -> bool:

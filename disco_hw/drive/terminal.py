@@ -175,12 +175,16 @@ class Keyboard:
     the source. To be made before the process takes on real time, so that its thread does not.
     """
 
+    # The operator decides.
+    task = ""
+
     def __init__(self, descriptor: int, hold: KeyHold, clock: Clock) -> None:
         self._descriptor = descriptor
         self._hold = hold
         self._clock = clock
         self._arrived: deque[tuple[int, bytes]] = deque()
-        self._ended: str | None = None
+        self.ended: str | None = None
+        """Reason why there will be no further input: Ctrl-D, or the terminal has closed."""
         self._gone = False
         self._typed = ""
         try:
@@ -202,11 +206,6 @@ class Keyboard:
         self._reader.start()
 
     @property
-    def ended(self) -> str | None:
-        """Reason why there will be no further input: Ctrl-D, or the terminal has closed."""
-        return self._ended
-
-    @property
     def completed(self) -> bool:
         """Whether the terminal is still there: a person drives for as long as they like."""
         return not self._gone
@@ -221,18 +220,13 @@ class Keyboard:
         """Whether a key is held that does not count before all keys were released for half a second."""
         return self._hold.is_ignored
 
-    @property
-    def task(self) -> str:
-        """Always empty, because the operator decides."""
-        return ""
-
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
         """Return the wheel speeds and the deadman after all keys typed so far; None once the terminal is gone."""
         self._handle(now_ns)
         if self._gone:
             return None
         held = self._hold.at(now_ns)
-        return held if self._ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
+        return held if self.ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
     def typed(self) -> str:
         """Return the printable keys that drive nothing, typed since it was asked last and seen by a poll."""
@@ -256,14 +250,14 @@ class Keyboard:
         """Act on what has arrived: one event in all, which keeps a poll short however much was typed."""
         keys: list[bytes] = []
         t_ns = now_ns
-        while self._arrived and self._ended is None:
+        while self._arrived and self.ended is None:
             t_ns, data = self._arrived.popleft()
             if not data:
-                self._gone, self._ended = True, "the terminal was closed"
+                self._gone, self.ended = True, "the terminal was closed"
             keys += parse(data)
             if b"\x04" in keys:
-                self._ended = "the operator ended the drive at the keyboard"
-        if keys and self._ended is None:
+                self.ended = "the operator ended the drive at the keyboard"
+        if keys and self.ended is None:
             # Any other key among them wins: it means stop.
             odd = [key for key in keys if key not in DIRECTIONS]
             answers = "".join(key.decode("ascii", "ignore") for key in odd if len(key) == 1 and key.isalnum())

@@ -63,18 +63,10 @@ class FencedDrive:
 class _Hand:
     """A pilot by hand whose wheel speeds somebody else sets."""
 
+    needs_pose, done = False, False
+
     def __init__(self) -> None:
         self.wheels = (0.0, 0.0)
-
-    @property
-    def needs_pose(self) -> bool:
-        """Whether a pose is needed: not by hand; the fence asks for one."""
-        return False
-
-    @property
-    def done(self) -> bool:
-        """Always False, because it drives until the run is over."""
-        return False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Drive at the wheel speeds that are set."""

@@ -426,17 +426,9 @@ class FindsWiring(Protocol):
 
 
 class TaskPilot:
-    """Leaves everything to the task and to the requests on the control socket."""
+    """Leaves everything to the task, which has no end of its own, and to the requests on the control socket."""
 
-    @property
-    def needs_pose(self) -> bool:
-        """A task cannot be followed without."""
-        return True
-
-    @property
-    def done(self) -> bool:
-        """The task has no end of its own."""
-        return False
+    needs_pose, done = True, False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Return a tick that follows the task and requests nothing."""

@@ -109,11 +109,6 @@ class FenceGuard:
         return self._boundaries
 
     @property
-    def settings(self) -> StoppingSettings:
-        """Settings of how the robot is assumed to stop."""
-        return self._settings
-
-    @property
     def is_active(self) -> bool:
         """Whether there is a fence or an obstacle."""
         bounds = self._boundaries
