@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log import MODEL_TOML, Attachment
@@ -30,8 +30,8 @@ from disco_hw.runtime.assembly import (
     assemble_core,
     create_fast_adaptation,
     create_pipeline,
-    create_planner,
     driver_of,
+    planner_of,
 )
 from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Pipeline, Planner
@@ -218,7 +218,7 @@ def drive_virtual(
         virtual = virtual_robot(setup, true_parameters(setup, None), start, effects=hide, seed=seed)
     except HiddenEffectError as error:
         raise InputError(f"hide: {error}") from None
-    run = SimulatedRun(setup, virtual, _planner(setup, law))
+    run = SimulatedRun(setup, virtual, planner_of(setup, law))
     run.start()
     rows: list[tuple[Any, ...]] = []
     events: list[str] = []
@@ -238,9 +238,3 @@ def _at_the_reference_controller(setup: Setup) -> Setup:
     usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
     changed = {name: usual[name] for name in ("link", "wheels", "pose")}
     return replace(setup, config=msgspec.structs.replace(setup.config, **changed))
-
-
-def _planner(setup: Setup, law: Law | None) -> Planner:
-    if law is None:
-        return create_planner(setup.config, setup.model)
-    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))

@@ -20,6 +20,7 @@ from disco_hw.adaptation.guard import (
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
+from disco_hw.control.plan import Law, LawController
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
@@ -65,6 +66,13 @@ def create_planner(config: RobotConfig, model: Model) -> control.Disco:
     )
     planner.warm_up()
     return planner
+
+
+def planner_of(setup: Setup, law: Law | None) -> Planner:
+    """Return the planner of this robot's task: DISCO, or a control law of the user's in its place."""
+    if law is None:
+        return create_planner(setup.config, setup.model)
+    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))
 
 
 def create_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
