@@ -19,11 +19,10 @@ from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.directions import Directions
 from disco_hw.runtime.obstacles import ObstacleRefused, UdpObstacles
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
-from disco_hw.runtime.planner_events import FOLLOWS, PlannerEvents
-from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
-from disco_hw.runtime.pose_jumps import PoseJumps
+from disco_hw.runtime.plausibility import FOLLOWS, Headway, PlannerEvents, Plausibility, PlausibilityStats, PoseJumps
 from disco_hw.runtime.robot_setup import record_of
 from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest

@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 
 from disco_hw.runtime import State
-from disco_hw.runtime.plausibility import Directions
+from disco_hw.runtime.directions import Directions
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor import AS_CONFIGURED, Wiring, rewired
 from drivers.types import PoseSample, WheelCommand, WheelSample
