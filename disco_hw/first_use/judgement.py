@@ -12,6 +12,7 @@ from itertools import pairwise, product
 from statistics import median
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -325,12 +326,10 @@ _SAME_RAD = 0.35
 _OFFSET_RAD = 0.2
 # The nearest multiple of it is what the mounting was meant to be.
 _QUARTER = 0.5 * math.pi
+_UNITS = ("position_unit", "yaw_unit", "clockwise", "mirrored")
 _METRES: tuple[Literal["m", "cm", "mm"], ...] = ("m", "cm", "mm")
 _RADIANS: tuple[Literal["rad", "deg"], ...] = ("rad", "deg")
-_CHOICES = tuple(
-    PoseConvention(unit, yaw, clockwise, mirrored)
-    for unit, yaw, clockwise, mirrored in product(_METRES, _RADIANS, (False, True), (False, True))
-)
+_CHOICES = tuple(PoseConvention(*units) for units in product(_METRES, _RADIANS, (False, True), (False, True)))
 
 
 @dataclass(frozen=True)
@@ -345,12 +344,7 @@ class _Fit:
 
 
 def _same_units(found: PoseConvention, configured: PoseConvention) -> bool:
-    return (found.position_unit, found.yaw_unit, found.clockwise, found.mirrored) == (
-        configured.position_unit,
-        configured.yaw_unit,
-        configured.clockwise,
-        configured.mirrored,
-    )
+    return all(getattr(found, name) == getattr(configured, name) for name in _UNITS)
 
 
 def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
@@ -369,13 +363,7 @@ def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
     near = _QUARTER * round(offset / _QUARTER)
     offset = near if abs(offset - near) < _OFFSET_RAD else offset
     return _Fit(
-        PoseConvention(
-            choice.position_unit,
-            choice.yaw_unit,
-            choice.clockwise,
-            choice.mirrored,
-            math.remainder(offset, 2 * math.pi),
-        ),
+        msgspec.structs.replace(choice, yaw_offset_rad=math.remainder(offset, 2 * math.pi)),
         abs(math.remainder(first - second, 2.0 * math.pi)),
         wheels_m,
         poses_m,
