@@ -20,7 +20,7 @@ from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinte
 from disco_hw.daemon.run import in_text, serve
 from disco_hw.drive import PAD_STATUS_TEXT, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
-from disco_hw.drive.fit import FittedScriptSource, ScriptGeometry
+from disco_hw.drive.fit import FittedScriptSource
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import create_script
@@ -29,7 +29,8 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log.reader import open_log
-from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
+from disco_hw.runtime.assembly import odometry_parameters
+from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _VIRTUAL_INTERFACES = ("unixcan", "virtual")
@@ -195,7 +196,7 @@ def _source(
         return source
     if not config.fence.is_set:
         return ScriptSource(script, source)
-    robot = ScriptGeometry(*geometry(setup.model)[0])
+    robot = odometry_parameters(setup.model)
     room = room_needed(script.at, script.duration_s, config.robot)
     return FittedScriptSource(script, source, robot, Boundaries(config.robot.footprint, config.fence), room)
 

@@ -122,10 +122,9 @@ class HandPilot:
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Poll the source once and judge what it says."""
-        state = State.DISCONNECTED if last is None else last.output.state
-        view = RobotView(state, self._driving, _measured(last), _pose(last), _is_held(last))
+        view = _view(last, self._driving)
         newest = self._source.poll(now_ns, view)
-        verdict = self._deadman.step(now_ns, newest, state)
+        verdict = self._deadman.step(now_ns, newest, view.state)
         if self._source.ended is not None:
             self._pending_messages.append(self._source.ended)
         elif verdict.event is not None:
@@ -175,21 +174,17 @@ class HandPilot:
         }
 
 
-def _measured(last: CoreTick | None) -> tuple[float, float] | None:
-    if last is None or not last.pipeline.estimate.wheels_ok:
-        return None
-    return last.pipeline.estimate.left_speed_rad_s, last.pipeline.estimate.right_speed_rad_s
-
-
-def _pose(last: CoreTick | None) -> tuple[float, float, float] | None:
-    if last is None or not last.pipeline.estimate.ok:
-        return None
+def _view(last: CoreTick | None, driving: bool) -> RobotView:
+    if last is None:
+        return RobotView(State.DISCONNECTED, driving)
     estimate = last.pipeline.estimate
-    return estimate.x_m, estimate.y_m, estimate.yaw_rad
-
-
-def _is_held(last: CoreTick | None) -> bool:
-    return last is not None and last.pipeline.fence.verdict in STOPS_MOTION
+    return RobotView(
+        last.output.state,
+        driving,
+        (estimate.left_speed_rad_s, estimate.right_speed_rad_s) if estimate.wheels_ok else None,
+        (estimate.x_m, estimate.y_m, estimate.yaw_rad) if estimate.ok else None,
+        last.pipeline.fence.verdict in STOPS_MOTION,
+    )
 
 
 _IN_USE = frozenset({State.ARMED, State.STOPPING})

@@ -157,12 +157,7 @@ class Pieces:
 
     def each(self, purpose: str, *state: tuple[str, float, float, float]) -> list[Manoeuvre]:
         """Several held ones (name, duration, forward, turn), each followed by a rest."""
-        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), self.rest())]
-
-    @staticmethod
-    def rest(duration_s: float = REST_S) -> Manoeuvre:
-        """Create a manoeuvre that stands still."""
-        return rest(duration_s)
+        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), rest())]
 
 
 # Five periods at 50 Hz: after a longer pause of the loop the script goes on from where it was.

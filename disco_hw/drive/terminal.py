@@ -21,7 +21,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,14 +78,6 @@ class _Hold(enum.Enum):
     LAPSED = "lapsed"
 
 
-@dataclass(frozen=True, slots=True)
-class KeyEvent:
-    """The newest key of those that came together, and when."""
-
-    t_ns: int
-    key: bytes
-
-
 class KeyHold:
     """Turns key events into wheel speeds and a deadman.
 
@@ -115,17 +106,17 @@ class KeyHold:
         lapsed = "; release all keys for half a second" if self._state is _Hold.LAPSED else ""
         return f"keyboard, {self._share:.0%} speed{lapsed}"
 
-    def press(self, event: KeyEvent) -> None:
-        """Take in a key."""
-        if event.key in DIRECTIONS:
-            self._state = self._after(event.t_ns)
-            self._direction = DIRECTIONS[event.key]
+    def press(self, t_ns: int, key: bytes) -> None:
+        """Take in the newest key of those that came together."""
+        if key in DIRECTIONS:
+            self._state = self._after(t_ns)
+            self._direction = DIRECTIONS[key]
         else:
             self._state = _Hold.LAPSED
-            if event.key in _DIGITS:
-                self._share = int(event.key) / 9.0
-        self._ignored = self._ignored + 1 if self._state is _Hold.LAPSED and event.key in DIRECTIONS else 0
-        self._last_ns = event.t_ns
+            if key in _DIGITS:
+                self._share = int(key) / 9.0
+        self._ignored = self._ignored + 1 if self._state is _Hold.LAPSED and key in DIRECTIONS else 0
+        self._last_ns = t_ns
 
     def at(self, now_ns: int) -> ManualInput:
         """Return the wheel speeds and the deadman at a time."""
@@ -263,7 +254,7 @@ class Keyboard:
             answers = "".join(key.decode("ascii", "ignore") for key in odd if len(key) == 1 and key.isalnum())
             self._typed = (self._typed + answers)[-_MOST_TYPED:]
             # What came after this tick began counts as of its beginning.
-            self._hold.press(KeyEvent(min(t_ns, now_ns), odd[-1] if odd else keys[-1]))
+            self._hold.press(min(t_ns, now_ns), odd[-1] if odd else keys[-1])
 
     def _read(self) -> None:
         """Wait for keys until there is no terminal, or `close()`; the thread's work."""

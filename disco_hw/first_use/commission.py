@@ -92,12 +92,9 @@ class CommissionResult:
         lines = []
         for stage in self.stages:
             lines += [f"{stage['name']}: {figure}" for figure in stage["figures"]]
-            lines += [f"{stage['name']}: {fault['name']}: {_how(fault)}" for fault in stage["faults"]]
+            for fault in stage["faults"]:
+                lines.append(f"{stage['name']}: {fault['name']}: {'corrected' if fault['mended'] else fault['text']}")
         return "\n".join([*lines, "commissioned" if self.ok else "not commissioned: correct what is named above"])
-
-
-def _how(fault: dict[str, Any]) -> str:
-    return "corrected" if fault["mended"] else str(fault["text"])
 
 
 def slowest_rad_s(setup: Setup) -> float:
@@ -169,6 +166,11 @@ def _through(
     return False
 
 
+def is_yes(reply: str) -> bool:
+    """Whether an operator's reply says yes."""
+    return reply.strip().lower() in {"y", "yes"}
+
+
 def write_fields(
     options: CommissionOptions, edits: dict[tuple[str, str], Any], ask: Callable[[str], str] = input
 ) -> bool:
@@ -180,7 +182,7 @@ def write_fields(
         print(f"  [{section}] {name} = {in_toml(value)}", file=sys.stderr)
     write = options.write
     if write is None:
-        write = ask(f"write this into {options.robot}? [y/n] ").strip().lower() in {"y", "yes"}
+        write = is_yes(ask(f"write this into {options.robot}? [y/n] "))
     if not write:
         return False
     old, _ = read_bytes(options.robot, ROBOT_TOML)
