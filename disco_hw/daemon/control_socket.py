@@ -318,7 +318,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "plausibility": asdict(core.plausibility),
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
-        "area": None if core.area is None else core.area.status(tick.pipeline.t_ns),
+        "area": core.area.status(tick.pipeline.t_ns),
     }
 
 

@@ -258,9 +258,6 @@ class Daemon:
     def _change_area(self, now_ns: int, message: ControlMessage) -> None:
         """Add or remove an obstacle, change the fence, or let a person drive in spite of it."""
         area, last = self._core.area, self._core.last
-        if area is None:
-            self._server.reply(message, {"ok": False, "error": "this drive has no fence guard"})
-            return
         state = State.DISCONNECTED if last is None else last.output.state
         try:
             if message.action == OBSTACLE:
@@ -281,8 +278,7 @@ class Daemon:
         state = State.DISCONNECTED if last is None else last.output.state
         try:
             task = changed_task(self._core.task, message.arguments, self._core.config.robot, state)
-            area = self._core.area
-            fault = None if area is None else task_breach(area.fence, area.footprint, task.course())
+            fault = task_breach(self._core.area.fence, self._core.area.footprint, task.course())
             if fault is not None:
                 raise TaskRefused(f"fence: {fault}; keep the task inside")
         except TaskRefused as refused:

@@ -225,10 +225,9 @@ def task_drive(
     x_m, y_m, yaw_rad = setup.config.task.course().start
     start = BodyPose(x_m, y_m, yaw_rad + facing_rad)
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
-    area, fence = run.core.area, setup.config.fence
-    assert area is not None
+    fence = setup.config.fence
     if not guarded:
-        area = run.core.area = _Overridden(area.guard, fence, FOOTPRINT)
+        run.core.area = _Overridden(run.core.area.guard, fence, FOOTPRINT)
     run.start()
     return _drive(run, seconds, fence, learning_s=learning_s)
 

@@ -97,9 +97,7 @@ class DaemonCore:
         self.pose_source = pose_source or RobotPoses()
         self.obstacle_source = obstacle_source
         self.pipeline = pipeline
-        guard = pipeline.guard
-        self.area = None if guard is None else SafeArea(guard, config.fence, config.robot.footprint)
-        """Fence and obstacles; None for a pipeline without a guard."""
+        self.area = SafeArea(pipeline.guard, config.fence, config.robot.footprint)
         self.recorder = recorder
         self.adaptation = adaptation or NoAdaptation()
         self._plausibility = Plausibility()
@@ -179,12 +177,11 @@ class DaemonCore:
         overridden = self._begin_fence(now_ns, by_hand)
         result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark, overridden)
         self._jump = self._jumps.step(result.estimate, result.pose_updates)
-        fence_events, fence_records = ((), []) if self.area is None else self.area.end(now_ns, result.fence, overridden)
+        fence_events, fence_records = self.area.end(now_ns, result.fence, overridden)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
-        doubts = self._plausibility.step(now_ns, readings.wheels, readings.poses, readings.power)
-        doubts = (*self._wheel_faults.events, *doubts)
+        doubts = self._plausibility.step(readings.wheels, readings.poses, readings.power)
         self._watch_wiring(now_ns, believed, command)
         events = (
             *readings.events,
@@ -192,9 +189,11 @@ class DaemonCore:
             *output.events,
             *estimated.events,
             *self._planner_events.step(result.source, result.plan, result.planner_failure),
+            *self._wheel_faults.events,
             *doubts,
+            *fence_events,
+            *self._stays(now_ns, output, result),
         )
-        events = (*events, *fence_events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
         self.recorder.put(
             now_ns,
@@ -241,9 +240,7 @@ class DaemonCore:
 
     def _begin_fence(self, now_ns: int, by_hand: bool) -> bool:
         """Take in what is reported of obstacles; returns whether a person drives in spite of the fence."""
-        if self.area is None:
-            return False
-        if self.area.guard.boundaries is not None and self.driver.limits is not None:
+        if self.driver.limits is not None:
             stops = self.driver.limits.stop_deceleration_rad_s2.value
             self.area.guard.set_deceleration(min(stops, self.config.robot.max_wheel_acceleration_rad_s2))
         for report in () if self.obstacle_source is None else self.obstacle_source.receive(now_ns):
@@ -303,7 +300,7 @@ class DaemonCore:
             by_hand=by_hand,
             poses_contradict=self.pipeline.fusion.sources.contradiction,
             pose_jump=self._jump,
-            fence_fault="" if self.area is None else self.area.task_fault,
+            fence_fault=self.area.task_fault,
         )
 
     def _to_learn_from(self, readings: Readings) -> Readings:

@@ -287,14 +287,13 @@ class Pipeline:
 
     A plan that is late or missing is followed on its tail for `plan_tail_s` after the tick it was made for; then the
     wheels ramp to zero. The governor runs in every tick, so that stopping obeys the acceleration limit as well.
-    `guard` checks every command; None without a fence guard.
+    `guard` checks every command.
     """
 
     def __init__(
-        self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
+        self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float, guard: FenceGuard,
         disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
         headings: HeadingWatch | None = None,
-        guard: FenceGuard | None = None,
     ) -> None:  # fmt: skip
         self.guard = guard
         self._avoids = planner if isinstance(planner, AvoidsBoundaries) else None
@@ -408,7 +407,7 @@ class Pipeline:
         self, estimate: PoseEstimate, source: Source, requested: tuple[float, float], overridden: bool
     ) -> tuple[FenceState, tuple[float, float]]:
         """Return the fence guard's verdict on the requested wheel speeds, and the speeds (rad/s) that it allows."""
-        if self.guard is None or not self.guard.is_active or source in {Source.OFF, Source.SILENT}:
+        if source in {Source.OFF, Source.SILENT}:
             return IDLE, requested
         last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)
         found = self.guard.step(estimate, self.fusion.parameters, last, requested, overridden)
@@ -441,7 +440,7 @@ class Pipeline:
             command_means=() if self._means is None else self._means.commands,
             body_means=() if self._means is None else self._means.body,
         )
-        if self._avoids is not None and self.guard is not None and self.guard.boundaries is not None:
+        if self._avoids is not None:
             self._avoids.look_around(self.guard.boundaries, corner_deviation_m(estimate, self.guard.boundaries))
         try:
             plan = self._planner.plan(now_ns, state)

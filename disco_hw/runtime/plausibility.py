@@ -60,11 +60,7 @@ class Plausibility:
         return PlausibilityStats(**self._counts)
 
     def step(
-        self,
-        now_ns: int,
-        wheels: Sequence[WheelSample],
-        poses: Sequence[PoseSample],
-        power: Sequence[PowerSample],
+        self, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], power: Sequence[PowerSample]
     ) -> tuple[str, ...]:
         """Take in a tick's samples; returns what began, in words."""
         return (*self._watch_supply(power), *self._watch_poses(poses, wheels))
