@@ -164,9 +164,9 @@ class Daemon:
             desired.motion,
             desired.by_hand,
         )
-        self._handle_messages(messages, tick.replies)
+        self._handle_messages(messages, tick.output.replies)
         self._fan = self._look_at_samples(now_ns) if tick.pipeline.plan is not None else ()
-        self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+        self._pilot.learn(now_ns, tick, tick.output.replies[len(requests) :])
         for text in desired.events:
             self._report("drive", text)
         for text in tick.events:

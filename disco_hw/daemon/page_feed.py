@@ -123,7 +123,7 @@ class ViewerFeed:
 class WatchedRecorder:
     """A recorder whose records go to the page as well, and to who wants each tick."""
 
-    def __init__(self, recorder: Recorder, feed: ViewerFeed, ticks: ViewerFeed | None = None) -> None:
+    def __init__(self, recorder: Recorder, feed: ViewerFeed, ticks: ViewerFeed) -> None:
         self._recorder = recorder
         self._feed = feed
         self._ticks = ticks
@@ -137,13 +137,11 @@ class WatchedRecorder:
         """Record the tick, then show it."""
         self._recorder.put(now_ns, records)
         self._feed.put(now_ns, records)
-        if self._ticks is not None:
-            self._ticks.put(now_ns, records)
+        self._ticks.put(now_ns, records)
 
     def announce(self, now_ns: int, wheels: Sequence[WheelSample]) -> None:
         """Show who wants each tick the wheels of one that is yet to be planned; `put` brings them again."""
-        if self._ticks is not None:
-            self._ticks.put(now_ns, wheels)
+        self._ticks.put(now_ns, wheels)
 
     def poll(self) -> RecorderStats:
         """Return the counters of the recorder."""

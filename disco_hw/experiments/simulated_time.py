@@ -120,7 +120,7 @@ class SimulatedRun:
             tick = self.core.tick(
                 now_ns, (*requests, *desired.requests), motion=desired.motion, by_hand=desired.by_hand
             )
-            self.pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+            self.pilot.learn(now_ns, tick, tick.output.replies[len(requests) :])
             requests = ()
             yield tick
 
@@ -132,7 +132,7 @@ class SimulatedRun:
         """Arm and start the task; raises WorkError if the robot refuses."""
         self.run(_READY_S)
         for tick in self.ticks(_ARMED_S, UserRequest.ARM):
-            for reply in tick.replies:
+            for reply in tick.output.replies:
                 if not reply.accepted:
                     raise WorkError(f"the virtual robot could not be armed: {reply.text}")
         self.run(self._period_us * 1e-6, UserRequest.START)

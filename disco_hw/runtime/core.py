@@ -66,11 +66,6 @@ class CoreTick(msgspec.Struct, frozen=True, gc=False):
     events: tuple[str, ...]
     readings: Readings = Readings()
 
-    @property
-    def replies(self) -> tuple[Reply, ...]:
-        """Answers to this tick's requests."""
-        return self.output.replies
-
 
 class DaemonCore:
     """Transport, driver, supervisor, pipeline and recorder in one tick.

@@ -174,5 +174,4 @@ def fence_of_record(record: records.FenceChange) -> Fence:
 
 def report_of_record(record: records.Obstacle) -> ObstacleReport:
     """Return the report that a record of an obstacle keeps."""
-    fields: dict[str, Any] = {name: getattr(record, name) for name in ObstacleReport.__struct_fields__}
-    return ObstacleReport(**fields)
+    return msgspec.convert(record, ObstacleReport, from_attributes=True)
