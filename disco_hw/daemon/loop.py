@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from array import array
+from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
@@ -33,45 +33,40 @@ class MonotonicClock:
             time.sleep(remaining_ns * 1e-9)
 
 
-# As Histogram says: buckets at most 1/64 wide, up to 2^44 ns.
-_MANTISSA_BITS = 7
-_HALF = 1 << (_MANTISSA_BITS - 1)
-_LARGEST_BITS = 44
-_BUCKETS = (_LARGEST_BITS - _MANTISSA_BITS + 2) * _HALF
+# Leading binary digits that a bucket keeps, so that it is at most 1/64 wide.
+_KEPT_BITS = 7
 
 
 class Histogram:
-    """Counts of durations in nanoseconds, from 0 to 2^44 ns (4.9 hours), in buckets at most 1/64 wide (1.6 %).
+    """Counts of durations in nanoseconds, in buckets at most 1/64 wide (1.6 %).
 
     The buckets are those of a high-dynamic-range histogram: exact up to 127, then 64 to each power of two.
     """
 
     def __init__(self) -> None:
-        self._counts = array("Q", bytes(8 * _BUCKETS))
+        self._counts: Counter[int] = Counter()
         self._count = 0
         self._total_ns = 0
         self._max_ns = 0
 
     def record(self, duration_ns: int) -> None:
-        """Count one duration in its bucket; a negative one counts as 0, one beyond the range in the last bucket."""
+        """Count one duration in its bucket; a negative one counts as 0."""
         duration_ns = max(duration_ns, 0)
-        self._counts[min(_bucket(duration_ns), _BUCKETS - 1)] += 1
+        self._counts[_upper_edge_ns(duration_ns)] += 1
         self._count += 1
         self._total_ns += duration_ns
         self._max_ns = max(self._max_ns, duration_ns)
 
     def percentile_ns(self, percent: float) -> float:
         """Return the duration that `percent` of all do not exceed, at most 1.6 % too high; NaN before the first."""
-        if not self._count:
-            return math.nan
         # Rounded first: 99.9 % of 41000 is 40959, not the next integer above 40959.00000000001.
         rank = max(1, math.ceil(round(percent * self._count / 100.0, 6)))
         seen = 0
-        for bucket, count in enumerate(self._counts):
+        for upper_edge_ns, count in sorted(self._counts.items()):
             seen += count
             if seen >= rank:
-                return float(min(_upper_edge_ns(bucket), self._max_ns))
-        return float(self._max_ns)
+                return float(min(upper_edge_ns, self._max_ns))
+        return math.nan
 
     def summary_s(self) -> dict[str, float]:
         """Return p50, p99, p99.9, max and mean in seconds under the keys p50_s, p99_s, p999_s, max_s, mean_s."""
@@ -84,15 +79,10 @@ class Histogram:
         }
 
 
-def _bucket(value: int) -> int:
-    shift = max(0, value.bit_length() - _MANTISSA_BITS)
-    # Beyond the exact range the leading bit is always set, so each further power of two takes half as many buckets.
-    return shift * _HALF + (value >> shift)
-
-
-def _upper_edge_ns(bucket: int) -> int:
-    shift = max(0, bucket // _HALF - 1)
-    return ((bucket - shift * _HALF + 1) << shift) - 1
+def _upper_edge_ns(duration_ns: int) -> int:
+    """Return the longest duration that is counted in the same bucket."""
+    shift = max(0, duration_ns.bit_length() - _KEPT_BITS)
+    return (((duration_ns >> shift) + 1) << shift) - 1
 
 
 class StageTimer:

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 
 from disco_hw import control
-from disco_hw.adaptation import GeometryAdaptation
+from disco_hw.adaptation import GeometryAdaptation, NoAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     REQUESTED_BY_FILE,
@@ -197,11 +197,9 @@ def assemble_core(
     )
     # Who drives by hand, and so without a pose, does not do the task.
     check = partial(preflight, config, with_task=needs_pose)
-    pose_source = pose_source_of(config)
-    obstacles = obstacle_source_of(config)
-    return DaemonCore(
-        config, transport, driver, supervisor, pipeline, recorder, check, adaptation, pose_source, obstacles
-    )
+    sources = pose_source_of(config), obstacle_source_of(config)
+    adapting = adaptation or NoAdaptation()
+    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adapting, *sources)
 
 
 def pose_source_of(config: RobotConfig) -> PoseSource:

@@ -14,7 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
-from disco_hw.adaptation import GeometryAdaptation, NoAdaptation
+from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
@@ -29,7 +29,6 @@ from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserR
 from disco_hw.runtime.wheel_faults import WheelFaults
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
-from drivers.pose.robot import RobotPoses
 from drivers.types import (
     Driver,
     DriverState,
@@ -82,19 +81,19 @@ class DaemonCore:
         pipeline: Pipeline,
         recorder: Recorder,
         preflight: Callable[[Driver], tuple[str, ...]],
-        adaptation: GeometryAdaptation | None = None,
-        pose_source: PoseSource | None = None,
-        obstacle_source: UdpObstacles | None = None,
+        adaptation: GeometryAdaptation,
+        pose_source: PoseSource,
+        obstacle_source: UdpObstacles | None,
     ) -> None:
         self.config = config
         self.transport = transport
         self.driver = driver
-        self.pose_source = pose_source or RobotPoses()
+        self.pose_source = pose_source
         self.obstacle_source = obstacle_source
         self.pipeline = pipeline
         self.area = SafeArea(pipeline.guard, config.fence, config.robot.footprint)
         self.recorder = recorder
-        self.adaptation = adaptation or NoAdaptation()
+        self.adaptation = adaptation
         self._plausibility = Plausibility()
         kind = find_driver(config.link.driver)
         card = kind.safety_card(config.link.settings())

@@ -141,17 +141,11 @@ class FenceGuard:
             return FenceState(FenceVerdict.OVERRIDDEN, 1.0, math.nan, reason="manual driving with the fence overridden")
         if self._missing:
             names = ", ".join(self._missing)
-            return FenceState(
-                FenceVerdict.OBSTACLE_LOST, 0.0, math.nan,
-                reason=f"obstacle {names} is no longer reported; report it again or remove it",
-            )  # fmt: skip
+            text = f"obstacle {names} is no longer reported; report it again or remove it"
+            return FenceState(FenceVerdict.OBSTACLE_LOST, 0.0, math.nan, reason=text)
         if not estimate.ok or not _are_finite(estimate, geometry, last_sent):
-            return FenceState(
-                FenceVerdict.NO_POSE,
-                0.0,
-                math.nan,
-                reason="no valid pose while a fence is set; check the pose sensor",
-            )
+            text = "no valid pose while a fence is set; check the pose sensor"
+            return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason=text)
         is_motion_requested = max(map(abs, requested)) > STOPPED_RAD_S if all(map(math.isfinite, requested)) else False
         desired = requested if is_motion_requested else (0.0, 0.0)
         # A path that overflows has no clearance, which stops the robot: a warning would say nothing more.
