@@ -153,7 +153,7 @@ def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
 
 
 # File descriptors (POSIX).
-STANDARD_OUTPUT, STANDARD_ERROR = 1, 2
+STANDARD_INPUT, STANDARD_OUTPUT, STANDARD_ERROR = 0, 1, 2
 # Chosen: lines for a terminal that has stopped reading; further ones are dropped and counted.
 _MOST_LINES = 1000
 

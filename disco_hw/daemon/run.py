@@ -158,7 +158,7 @@ def serve(
             stop.add("page feed", feed.close)
             ticks = ViewerFeed(tick_feed_path(server.path), period_s=0.0)
             stop.add("tick feed", ticks.close)
-            log = _log_path(config, log_file)
+            log = log_file or (new_log(config) if config.log.enabled else None)
             recorder = WatchedRecorder(_create_recorder(setup, log), feed, ticks)
             if advice_style is not None and log is not None:
                 stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
@@ -203,12 +203,10 @@ def _progress(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
-    """Return the path of the log; None if nothing is recorded."""
-    if log_file is not None or not config.log.enabled:
-        return log_file
+def new_log(config: RobotConfig, what: str = "") -> Path:
+    """Return the path of a new log: the directory of [log], the name of the robot, what is recorded, the time (UTC)."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{stamp}.mcap"
+    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{what}{stamp}.mcap"
 
 
 def _create_recorder(setup: Setup, log: Path | None) -> Recorder:

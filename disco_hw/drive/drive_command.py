@@ -9,15 +9,14 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from disco_hw.config import Link, RobotConfig
 from disco_hw.daemon import socket_path
 from disco_hw.daemon.loop import MonotonicClock
-from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
-from disco_hw.daemon.run import in_text, serve
+from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_INPUT, STANDARD_OUTPUT, AsyncPrinter
+from disco_hw.daemon.run import in_text, new_log, serve
 from disco_hw.drive import PAD_STATUS_TEXT, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.fit import FittedScriptSource
@@ -27,7 +26,7 @@ from disco_hw.drive.scripts import create_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
 from disco_hw.fence.clearance import Boundaries
-from disco_hw.files import check_log_file, file_name_of
+from disco_hw.files import check_log_file
 from disco_hw.log.reader import open_log
 from disco_hw.runtime.assembly import odometry_parameters
 from disco_hw.runtime.robot_setup import Setup, load_setup
@@ -37,8 +36,6 @@ _VIRTUAL_INTERFACES = ("unixcan", "virtual")
 _PSEUDO_TERMINALS = "/dev/pts/"
 # Chosen: longer than the display's process takes to end by itself; then it is killed.
 _DISPLAY_TIMEOUT_S = 2.0
-# File descriptor (POSIX).
-_STANDARD_INPUT = 0
 
 
 def leads_to_virtual_robot(link: Link) -> bool:
@@ -103,7 +100,7 @@ def run_drive(options: DriveOptions, page_messages: Callable[[], tuple[str, ...]
     setup = load_setup(options.robot, options.model, options.link)
     config = setup.config
     script = _script(options, config)
-    log_file = options.log_file or _new_log(config)
+    log_file = options.log_file or new_log(config, "drive-")
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
     prompt = "cmd_vel: arm through the bridge, then it drives; Ctrl-C ends" if options.ros2 else PAD_STATUS_TEXT
     page = PageSource(top_rad_s, config.drive.turn_share, prompt) if options.page or options.ros2 else None
@@ -191,7 +188,7 @@ def _source(
     elif options.gamepad:
         source = _gamepad(config, top_rad_s)
     else:
-        source = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
+        source = Keyboard(STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
     if script is None:
         return source
     if not config.fence.is_set:
@@ -222,11 +219,6 @@ def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
     except GamepadError as error:
         raise InputError(f"--gamepad: {error}") from None
     return GamepadSource(pad, open_pad, top_rad_s, settings.turn_share, settings.gamepad_silence_s)
-
-
-def _new_log(config: RobotConfig) -> Path:
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-drive-{stamp}.mcap"
 
 
 @contextmanager

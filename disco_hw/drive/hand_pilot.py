@@ -10,7 +10,7 @@ from typing import Any
 from disco_hw.config import RobotConfig
 from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, ManualSource, PageSource, RobotView, steering_from
 from disco_hw.drive.coverage import Coverage
-from disco_hw.runtime import State
+from disco_hw.runtime import IN_USE, State
 from disco_hw.runtime.core import CoreTick, Pilot, PilotTick, TaskPilot
 from disco_hw.runtime.fence_guard import STOPS_MOTION
 from disco_hw.runtime.pipeline import Manual, Source, Standstill
@@ -187,9 +187,6 @@ def _view(last: CoreTick | None, driving: bool) -> RobotView:
     )
 
 
-_IN_USE = frozenset({State.ARMED, State.STOPPING})
-
-
 class UntilHeading:
     """Hands over between two drives only: who drives stays the same from arming until the robot is disarmed.
 
@@ -214,7 +211,7 @@ class UntilHeading:
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Choose whose turn it is and ask that one."""
-        if last is not None and last.output.state not in _IN_USE:
+        if last is not None and last.output.state not in IN_USE:
             estimate = last.pipeline.estimate
             missing = estimate.initialised and not estimate.heading_known
             self._now = self._by_hand if missing else self._task

@@ -123,55 +123,29 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
     if dead:
         names = " and ".join(SIDES[side] for side in dead)
         return [Fault("encoder dead", f"the {names} wheel turned but its encoder did not count; check its cable")]
-    faults = []
+    found: list[tuple[str, str]] = []
+    edits: dict[tuple[str, str], Any] = {}
     if swapped != old.sides_swapped:
-        faults.append(
-            Fault(
-                "sides swapped",
-                "the controller's left side drives the right wheels",
-                {("wheels", "sides_swapped"): swapped},
-            )
-        )
+        found.append(("sides swapped", "the controller's left side drives the right wheels"))
+        edits["wheels", "sides_swapped"] = swapped
     if crossed != old.encoders_swapped:
-        faults.append(
-            Fault(
-                "encoders swapped",
-                "the left and right encoders are exchanged",
-                {("wheels", "encoders_swapped"): crossed},
-            )
-        )
-    for side in (0, 1):
-        motor_wrong = seen["lr".index(_side_of(seen, side))].seen[1] == "b"
-        if motor_wrong:
-            faults.append(
-                Fault(
-                    f"{SIDES[side]} motor reversed",
-                    f"forward turns the {SIDES[side]} wheels backward",
-                    {("wheels", "motor_direction"): motors},
-                )
-            )
+        found.append(("encoders swapped", "the left and right encoders are exchanged"))
+        edits["wheels", "encoders_swapped"] = crossed
+    for one in sorted(seen, key=lambda one: one.seen[0]):
+        side = "lr".index(one.seen[0])
+        name = SIDES[side]
+        if one.seen[1] == "b":
+            found.append((f"{name} motor reversed", f"forward turns the {name} wheels backward"))
+            edits["wheels", "motor_direction"] = motors
         elif encoders[side] != old.encoder_direction[side]:
-            faults.append(
-                Fault(
-                    f"{SIDES[side]} encoder reversed",
-                    f"the {SIDES[side]} encoder counts down when its wheel turns forward",
-                    {("wheels", "encoder_direction"): encoders},
-                )
-            )
+            found.append((f"{name} encoder reversed", f"the {name} encoder counts down when its wheel turns forward"))
+            edits["wheels", "encoder_direction"] = encoders
     if encoders != list(old.encoder_direction):
-        faults = [_with(fault, ("wheels", "encoder_direction"), encoders) for fault in faults]
+        edits["wheels", "encoder_direction"] = encoders
     if motors != list(old.motor_direction):
-        faults = [_with(fault, ("wheels", "motor_direction"), motors) for fault in faults]
-    return faults
-
-
-def _side_of(seen: Sequence[SideSeen], side: int) -> str:
-    """Return which commanded side turned this one, as a letter."""
-    return "lr"[next(commanded for commanded, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
-
-
-def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
-    return Fault(fault.name, fault.text, {**fault.edits, place: value})
+        edits["wheels", "motor_direction"] = motors
+    # Each needs all the others: a wheel that is found under another name has that one's direction.
+    return [Fault(name, text, edits) for name, text in found]
 
 
 def _dead_band(side: int, track: Track) -> str:

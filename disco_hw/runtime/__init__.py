@@ -29,6 +29,10 @@ class State(enum.Enum):
     FAULT = "fault"
 
 
+IN_USE = frozenset({State.ARMED, State.STOPPING})
+"""States in which nothing may be changed that a drive depends on."""
+
+
 class Condition:
     """Conditions that hold in one tick, in which the table of transitions is written: bits of an integer.
 

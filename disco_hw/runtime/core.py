@@ -122,7 +122,7 @@ class DaemonCore:
         self._generation = 0
         self._link_up = False
         self._planner_events = PlannerEvents(config.control.fallback)
-        self._state = supervisor.state
+        self.state = supervisor.state
         self._last_reported: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
         self._task_changed = False
@@ -343,7 +343,7 @@ class DaemonCore:
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
         """Return the record of a change of state or of what is said of it, in the tick in which it happens."""
-        before, self._state = self._state, output.state
+        before, self.state = self.state, output.state
         last, self._last_reported = self._last_reported, (output.detail, output.running, output.estop)
         if output.state is before and self._last_reported == last:
             return []
