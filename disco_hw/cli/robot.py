@@ -35,6 +35,15 @@ def _page(
     return page_in_background(robot, model, LOOPBACK, port, link) if view else nullcontext()
 
 
+def _prepare_loop() -> None:
+    """Prepare this process for the control loop, before the numeric libraries are loaded."""
+    from disco_hw.processes import limit_thread_pools, spare_memory
+
+    # A pool of threads in them costs the loop its deadlines.
+    limit_thread_pools()
+    spare_memory()
+
+
 def _no_messages() -> tuple[str, ...]:
     return ()
 
@@ -55,11 +64,7 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
-    from disco_hw.processes import limit_thread_pools, spare_memory
-
-    # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
-    limit_thread_pools()
-    spare_memory()
+    _prepare_loop()
     check_named_files(robot, model)
     from disco_hw.daemon.run import DaemonOptions, run_daemon
     from disco_hw.drive.hand_pilot import task_pilot
@@ -96,10 +101,7 @@ def drive(
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
-    from disco_hw.processes import limit_thread_pools, spare_memory
-
-    limit_thread_pools()
-    spare_memory()
+    _prepare_loop()
     check_named_files(robot, model)
     from disco_hw.drive.drive_command import DriveOptions, run_drive
 
@@ -194,10 +196,7 @@ def commission(
     as_json: AsJson = False,
 ) -> None:
     """Guide the first drive: wheels up, then on the floor; finds wrong wiring, ticks and poses (docs/commission.md)."""
-    from disco_hw.processes import limit_thread_pools, spare_memory
-
-    limit_thread_pools()
-    spare_memory()
+    _prepare_loop()
     check_named_files(robot)
     from disco_hw.first_use.commission import CommissionOptions, run_commission
 

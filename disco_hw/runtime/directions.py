@@ -86,6 +86,10 @@ class Directions:
 
     def __init__(self, radius_m: float, track_m: float, wiring: Wiring) -> None:
         self._radius_m, self._track_m, self._wiring = radius_m, track_m, wiring
+        self.is_evaluated = False
+        self._reset()
+
+    def _reset(self) -> None:
         self._turned: list[tuple[int, float, float]] = []
         self._start: _Start | None = None
         self._begun_ns: int | None = None
@@ -93,10 +97,11 @@ class Directions:
         self._commanded: Pair = (0.0, 0.0)
         self._before: Pair = (0.0, 0.0)
         self._signs: tuple[float, ...] = (0.0, 0.0)
-        self._reversed = self._found = self.is_evaluated = False
+        self._reversed = self._found = False
         self._in_a_row = ("", 0)
-        self._evidence: dict[tuple[bool, tuple[int, ...]], float] = {}
-        self._reset()
+        every = itertools.product((False, True), itertools.product((1, -1), repeat=2))
+        self._evidence: dict[tuple[bool, tuple[int, ...]], float]
+        self._evidence = {wired: 0.0 for wired in every if wired != (False, (1, 1))}
 
     def step(
         self,
@@ -124,7 +129,7 @@ class Directions:
         if self._begun_ns is None:
             self._wait_for_motion(now_ns, wheels, poses, commanded)
         else:
-            signs = [math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in commanded]
+            signs = _signs(commanded)
             self._reversed = self._reversed or any(a * b < 0.0 for a, b in zip(signs, self._signs, strict=True))
             self._signs = tuple(new or old for new, old in zip(signs, self._signs, strict=True))
             step_s = (now_ns - self._last_ns) * 1e-9
@@ -137,19 +142,6 @@ class Directions:
             self._found = found is not None
             return found
         return None
-
-    def _reset(self) -> None:
-        self._turned = []
-        self._start = None
-        self._begun_ns = None
-        self._last_ns = 0
-        self._commanded = (0.0, 0.0)
-        self._before = (0.0, 0.0)
-        self._signs = (0.0, 0.0)
-        self._reversed = self._found = False
-        self._in_a_row = ("", 0)
-        every = itertools.product((False, True), itertools.product((1, -1), repeat=2))
-        self._evidence = {wired: 0.0 for wired in every if wired != (False, (1, 1))}
 
     def _wait_for_motion(
         self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], commanded: Pair
@@ -164,7 +156,7 @@ class Directions:
         if max(map(abs, commanded)) > MOVES_RAD_S and is_stationary and self._turned:
             self._begun_ns = self._last_ns = now_ns
             self._before = commanded
-            self._signs = tuple(math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in commanded)
+            self._signs = _signs(commanded)
         del self._turned[:-1]
 
     def _moved(self, t_ns: int) -> Pair:
@@ -281,6 +273,11 @@ class Directions:
             f"the poses and the wheels show different motion: {', '.join(texts)}; in robot.toml write "
             f"{' and '.join(changes)}, or correct [pose] if the frame of the poses is wrong"
         )
+
+
+def _signs(speeds: Pair) -> tuple[float, ...]:
+    """Return the direction of each commanded wheel; 0 for one that may not turn."""
+    return tuple(math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in speeds)
 
 
 def _cosine(one: Pair, other: Pair) -> float:
