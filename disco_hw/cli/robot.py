@@ -242,11 +242,7 @@ def ctl(
         raise typer.Exit(1)
 
 
-def check(
-    robot: RobotFile,
-    link: LinkOption = None,
-    as_json: AsJson = False,
-) -> None:
+def check(robot: RobotFile, link: LinkOption = None, as_json: AsJson = False) -> None:
     """Check link, firmware match, latency, bus load, real-time settings and limits before a drive.
 
     Nothing moves.
@@ -262,11 +258,7 @@ def check(
         raise typer.Exit(1)
 
 
-def estop(
-    robot: RobotFile,
-    link: LinkOption = None,
-    as_json: AsJson = False,
-) -> None:
+def estop(robot: RobotFile, link: LinkOption = None, as_json: AsJson = False) -> None:
     """Stop the robot now, whatever state the daemon is in."""
     from disco_hw.daemon.emergency import stop_and_report
 

@@ -25,13 +25,7 @@ from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
-from disco_hw.runtime.assembly import (
-    assemble_core,
-    create_fast_adaptation,
-    create_pipeline,
-    driver_of,
-    planner_of,
-)
+from disco_hw.runtime.assembly import assemble_core, create_fast_adaptation, create_pipeline, driver_of, planner_of
 from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files, load_setup

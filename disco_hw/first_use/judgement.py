@@ -17,15 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.config import Robot
-from disco_hw.first_use.procedure import (
-    RUNAWAY_SHARE,
-    SIDES,
-    SLOWING,
-    FloorSeen,
-    SideSeen,
-    Track,
-    TurnsSeen,
-)
+from disco_hw.first_use.procedure import RUNAWAY_SHARE, SIDES, SLOWING, FloorSeen, SideSeen, Track, TurnsSeen
 from drivers.motor import Wiring
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample

@@ -95,9 +95,6 @@ class Governor:
     def step(self, desired_left_rad_s: float, desired_right_rad_s: float, dt_s: float) -> Governed:
         """Return the wheel speeds that the limits allow `dt_s` after the last command.
 
-        The desired speeds are scaled to the speed limit by a common factor. The result is the point on the line from
-        the last command to them that is as far as both wheels' accelerations allow.
-
         A desired command that is not finite counts as standstill. A `dt_s` that is negative or not a
         number counts as none, one beyond 1.5 nominal periods as 1.5 periods.
         """
