@@ -14,7 +14,6 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -57,19 +56,6 @@ class StopSignals:
             self.received = signal.Signals(number)
 
 
-@dataclass(frozen=True, slots=True)
-class StepOutcome:
-    """Outcome of one step; `error` says what failed, None if nothing did."""
-
-    name: str
-    error: str | None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the step did what it should."""
-        return self.error is None
-
-
 class StopPath:
     """Steps to stop with, each in a guard of its own; what was added last runs first, so the wheels are added last.
 
@@ -83,19 +69,17 @@ class StopPath:
         """Add a step, which will run before all those added so far."""
         self._steps.append((name, step))
 
-    def run(self) -> list[StepOutcome]:
-        """Run every step once and return how each ended; never raises, and a second call runs nothing."""
-        outcomes = []
+    def run(self) -> dict[str, str]:
+        """Run every step once and return what failed, by the step's name; never raises, a second call runs nothing."""
+        failed = {}
         while self._steps:
             name, step = self._steps.pop()
             try:
                 step()
             # Also SystemExit and KeyboardInterrupt: nothing may keep the steps after this one from running.
             except BaseException as error:
-                outcomes.append(StepOutcome(name, f"{type(error).__name__}: {error}"))
-            else:
-                outcomes.append(StepOutcome(name, None))
-        return outcomes
+                failed[name] = f"{type(error).__name__}: {error}"
+        return failed
 
 
 class Notifier:

@@ -190,11 +190,10 @@ def serve(
             code = daemon.run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
-            outcomes = stop.run()
-            for outcome in outcomes:
-                if not outcome.ok:
-                    report("stop", f"{outcome.name}: {outcome.error}")
-        return code or int(any(outcome.name == _RECORDER and not outcome.ok for outcome in outcomes))
+            failed = stop.run()
+            for name, error in failed.items():
+                report("stop", f"{name}: {error}")
+        return code or int(_RECORDER in failed)
 
 
 def _progress(text: str) -> None:
