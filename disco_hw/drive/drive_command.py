@@ -177,9 +177,11 @@ def _source(
         raise InputError(f"{' and '.join(chosen)}: only one deadman can be used; leave one of them out")
     source: ManualSource
     if options.unattended:
-        if not leads_to_virtual_robot(config.link):
+        link = config.link
+        if not leads_to_virtual_robot(link):
+            named = f"port {link.port}" if link.kind == "serial" else f"interface {link.interface} {link.channel}"
             raise InputError(
-                f"--unattended: {_option(config.link)} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
+                f"--unattended: link.{named} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
                 "--page, --ros2), or start the virtual robot first"
             )
         source = Unattended()
@@ -196,10 +198,6 @@ def _source(
     robot = odometry_parameters(setup.model)
     room = room_needed(script.at, script.duration_s, config.robot)
     return FittedScriptSource(script, source, robot, Boundaries(config.robot.footprint, config.fence), room)
-
-
-def _option(link: Link) -> str:
-    return f"link.port {link.port}" if link.kind == "serial" else f"link.interface {link.interface} {link.channel}"
 
 
 def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:

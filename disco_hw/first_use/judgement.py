@@ -365,10 +365,11 @@ def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
 
 
 def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
+    way = "clockwise" if found.convention.clockwise else "counter-clockwise"
     names = {
         "position_unit": ("pose in other units", f"positions come in {found.convention.position_unit}"),
         "yaw_unit": ("yaw in other units", f"the yaw comes in {found.convention.yaw_unit}"),
-        "clockwise": ("yaw the other way round", _clockwise(found.convention.clockwise)),
+        "clockwise": ("yaw the other way round", f"the yaw grows {way}"),
         "mirrored": ("axes mirrored", "left and right are exchanged in the frame of the poses"),
     }
     faults = [
@@ -389,10 +390,6 @@ def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
     return faults
 
 
-def _clockwise(clockwise: bool) -> str:
-    return "the yaw grows clockwise" if clockwise else "the yaw grows counter-clockwise"
-
-
 def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     """Return lines on where the sensor sits beside the centre of the turns, and its delay against the wheels."""
     convention = best.convention
@@ -402,10 +399,13 @@ def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     ahead = "ahead of" if forward > 0.0 else "behind"
     aside = "left" if left > 0.0 else "right"
     direction = "behind" if _mean(delays) > 0.0 else "ahead of"
+    poses = seen.straight.poses
+    rate_hz = (len(poses) - 1) / max(1e-9, (poses[-1].t_ns - poses[0].t_ns) * 1e-9)
+    age_ms = median((pose.received_ns - pose.t_ns) * 1e-6 for pose in poses)
     lines = [
         f"lever arm: the sensor is {abs(forward):.2f} m {ahead} and {abs(left):.2f} m to the {aside} of the point "
         f"about which the robot turns (x_icr_m = {-forward:.2f})",
-        f"poses: {_rate(seen):.0f} a second, {_age_ms(seen):.0f} ms old on arrival, their stamps "
+        f"poses: {rate_hz:.0f} a second, {age_ms:.0f} ms old on arrival, their stamps "
         f"{abs(1e3 * _mean(delays)):.0f} ms {direction} the wheels'",
     ]
     if abs(left) > POSE_STD_LEFT_M:
@@ -441,12 +441,3 @@ def _mismatch(
     base = np.column_stack([np.ones_like(at), np.interp(at, t, turn)])
     left = yaw - base @ np.linalg.lstsq(base, yaw, rcond=None)[0]
     return float(left @ left)
-
-
-def _age_ms(seen: FloorSeen) -> float:
-    return median((pose.received_ns - pose.t_ns) * 1e-6 for pose in seen.straight.poses)
-
-
-def _rate(seen: FloorSeen) -> float:
-    poses = seen.straight.poses
-    return (len(poses) - 1) / max(1e-9, (poses[-1].t_ns - poses[0].t_ns) * 1e-9)

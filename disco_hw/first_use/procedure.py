@@ -322,7 +322,7 @@ def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
     """
     limit_s = 1.5 * travel_m / (max(wheels) * robot.wheel_radius_m)
     track, driven_ns, last_ns = Track(), 0, 0
-    while not track.commands or not _at_rest_long(track):
+    while not track.commands or (track.commands[-1][0] - track.commands[0][0]) * 1e-9 < _REST_S:
         seen: Seen = yield DriveWheels((0.0, 0.0), f"hold: {what}")
         if seen.driving:
             track.add(seen)
@@ -336,10 +336,6 @@ def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
         track.add(seen)
     yield from _rest(track, _REST_S, f"hold: {what}, done")
     return track
-
-
-def _at_rest_long(track: Track) -> bool:
-    return (track.commands[-1][0] - track.commands[0][0]) * 1e-9 >= _REST_S
 
 
 class Procedure:

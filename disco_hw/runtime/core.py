@@ -49,10 +49,6 @@ STATUS_HOLDS_NS = 500_000_000
 _FOLLOW_TASK = FollowTask()
 
 
-def unannounced(_now_ns: int, _wheels: Sequence[WheelSample]) -> None:
-    """Nobody hears the wheels before the record of their tick."""
-
-
 class CoreTick(msgspec.Struct, frozen=True, gc=False):
     """Result of one tick: the supervisor's verdict, the pipeline's work, the command sent (None if none was).
 
@@ -109,7 +105,7 @@ class DaemonCore:
         self.last: CoreTick | None = None
         self.recording_fault = ""
         """Why nothing is recorded although it should be, kept up to date by whoever looks after the recorder."""
-        self.announce: Callable[[int, Sequence[WheelSample]], None] = unannounced
+        self.announce: Callable[[int, Sequence[WheelSample]], None] = lambda _now_ns, _wheels: None
         """Hears the wheels of a tick before it is planned, for whoever cannot wait for its record; must not block."""
         self._jumps = PoseJumps()
         self._jump = ""
