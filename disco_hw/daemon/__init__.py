@@ -231,9 +231,7 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     """Send one request to the daemon of `robot`, and return its reply.
 
     `changes`: the request's further words, such as "radius_m=0.8"; `task`, `obstacle` and `fence` need them, and no
-    other request takes any.
-
-    `unrecorded`, for `arm` alone: arm even though nothing is recorded that should be.
+    other request takes any. `unrecorded`, for `arm` alone: arm even though nothing is recorded that should be.
 
     Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon; for an e-stop
     with what stops the robot all the same.

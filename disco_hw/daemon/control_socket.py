@@ -266,9 +266,8 @@ def loop_figures(loop: LoopStats) -> dict[str, Any]:
 def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> dict[str, Any]:
     """Return everything that an operator or a page needs to know now; what does not exist is None.
 
-    `robot_state_ns`: when the newest frame with the robot's state arrived, on the monotonic clock of this host.
-
-    `loop` is from `loop_figures`.
+    `robot_state_ns`: when the newest frame with the robot's state arrived, on this host's monotonic clock. `loop` is
+    from `loop_figures`.
     """
     tick = core.last
     if tick is None:

@@ -57,11 +57,10 @@ class Condition:
     ESTOP_REQUESTED = 1 << 14  # held from the request until a reset is accepted
     RESET_PENDING = 1 << 15
     PREFLIGHT_ERROR = 1 << 16
-    DAEMON_ERROR = 1 << 17
 
 
 C = Condition
-PROBLEM = C.DAEMON_ERROR | C.ESTOP_REQUESTED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
+PROBLEM = C.ESTOP_REQUESTED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
 _CONNECTED = frozenset(State) - {State.DISCONNECTED}
 _UNTROUBLED = _CONNECTED - {State.FAULT}
 
@@ -88,7 +87,6 @@ TRANSITIONS: tuple[Transition, ...] = (
     Transition(_CONNECTED, S.DISCONNECTED, C.NONE, C.LINK_UP, "the link is down"),
     Transition(_CONNECTED, S.DISCONNECTED, C.LINK_RENEWED, C.NONE, "the link was interrupted"),
     # Problems latch until a reset.
-    Transition(_UNTROUBLED, S.FAULT, C.DAEMON_ERROR, C.NONE, "the daemon failed"),
     Transition(_UNTROUBLED, S.FAULT, C.ESTOP_REQUESTED, C.NONE, "e-stop requested by the operator"),
     Transition(_UNTROUBLED, S.FAULT, C.ROBOT_ESTOP, C.NONE, "the robot is in e-stop"),
     Transition(_UNTROUBLED, S.FAULT, C.ROBOT_FAULT, C.NONE, "the robot reports a fault"),

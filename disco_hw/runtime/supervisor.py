@@ -56,9 +56,9 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     """Inputs of the supervisor in one tick.
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
-    magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and
-    `daemon_error` are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the
-    task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
+    magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors`
+    are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the task is left to
+    drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
     being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
     in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty. `fence_fault`:
@@ -74,7 +74,6 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     pose_ok: bool
     link_error: str | None = None
     preflight_errors: tuple[str, ...] = ()
-    daemon_error: str | None = None
     requests: tuple[UserRequest, ...] = ()
     task_finished: bool = False
     recording_fault: str = ""
@@ -181,7 +180,6 @@ class Supervisor:
                 (C.TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
                 (C.WHEELS_STATIONARY, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
                 (C.PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
-                (C.DAEMON_ERROR, inputs.daemon_error is not None),
             )
         )
         if link_up:
@@ -277,8 +275,6 @@ class Supervisor:
     def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.FAULT:
             return f"nothing to reset in state {self._state.value}"
-        if inputs.daemon_error is not None:
-            return f"the daemon failed ({inputs.daemon_error}); restart it"
         if inputs.preflight_errors:
             return f"{inputs.preflight_errors[0]}; correct it and restart the daemon"
         if self._estop_requested and not seen & C.ROBOT_ESTOP:
@@ -360,8 +356,6 @@ class Supervisor:
 
     def _fault_text(self, inputs: Inputs) -> str:
         """Return what a person should know of the present state."""
-        if inputs.daemon_error is not None:
-            return inputs.daemon_error
         if inputs.link_state is LinkState.UP and self._state is State.FAULT:
             if inputs.preflight_errors:
                 return "; ".join(inputs.preflight_errors)
