@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -22,17 +22,21 @@ from disco_hw.cli.options import (
 )
 from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, PageProcess
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, page_in_background
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
 
+@contextmanager
 def _page(
     view: bool, robot: Path, model: Path | None, port: int, link: str | None
-) -> AbstractContextManager[PageProcess | None]:
-    from disco_hw.viewer import page_in_background
-
-    return page_in_background(robot, model, LOOPBACK, port, link) if view else nullcontext()
+) -> Iterator[Callable[[], tuple[str, ...]]]:
+    """Serve the page meanwhile if `view`; yields a function that says what happened to it since the last call."""
+    if not view:
+        yield lambda: ()
+        return
+    with page_in_background(robot, model, LOOPBACK, port, link) as page:
+        yield page.new_messages
 
 
 def _prepare_loop() -> None:
@@ -42,10 +46,6 @@ def _prepare_loop() -> None:
     # A pool of threads in them costs the loop its deadlines.
     limit_thread_pools()
     spare_memory()
-
-
-def _no_messages() -> tuple[str, ...]:
-    return ()
 
 
 def run(
@@ -69,9 +69,9 @@ def run(
     from disco_hw.daemon.run import DaemonOptions, run_daemon
     from disco_hw.drive.hand_pilot import task_pilot
 
-    with _page(view, robot, model, port, link) as page:
+    with _page(view, robot, model, port, link) as page_messages:
         options = DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt)
-        code = run_daemon(options, task_pilot, page_messages=_no_messages if page is None else page.new_messages)
+        code = run_daemon(options, task_pilot, page_messages=page_messages)
     raise typer.Exit(code)
 
 
@@ -105,7 +105,7 @@ def drive(
     check_named_files(robot, model)
     from disco_hw.drive.drive_command import DriveOptions, run_drive
 
-    with _page(view or page, robot, model, port, link) as served:
+    with _page(view or page, robot, model, port, link) as page_messages:
         result = run_drive(
             DriveOptions(
                 robot=robot,
@@ -121,7 +121,7 @@ def drive(
                 seed=seed,
                 as_json=as_json,
             ),
-            _no_messages if served is None else served.new_messages,
+            page_messages,
         )
     print_result(result.as_dict(), as_json, result.as_text())
     if not result.completed:

@@ -6,7 +6,6 @@ a pilot says: the task's planner, or somebody in its place.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -126,8 +125,8 @@ class DaemonCore:
     @property
     def plausibility(self) -> PlausibilityStats:
         """A snapshot of what was counted of wheels, supply and poses."""
-        counted = self._plausibility.stats
-        return dataclasses.replace(counted, wheels_not_following=self._wheel_faults.not_following)
+        counted = self._plausibility
+        return PlausibilityStats(self._wheel_faults.not_following, counted.supply_dips, counted.poses_frozen)
 
     def set_task(self, task: RobotTask) -> None:
         """Follow another task of the same kind from the next tick on, in which it is recorded."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 from disco_hw.control.plan import WheelPlan
 from disco_hw.estimation import PoseEstimate
@@ -48,16 +48,11 @@ class Plausibility:
     """
 
     def __init__(self) -> None:
-        self._counts = asdict(PlausibilityStats())
+        self.supply_dips = self.poses_frozen = 0
         self._supply_v: float | None = None
         self._supply_ns = 0
         self._dipped = False
         self._poses: dict[int, tuple[tuple[float, float, float], int]] = {}
-
-    @property
-    def stats(self) -> PlausibilityStats:
-        """A snapshot of the counters."""
-        return PlausibilityStats(**self._counts)
 
     def step(
         self, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], power: Sequence[PowerSample]
@@ -74,7 +69,7 @@ class Plausibility:
             mean = volts if self._supply_v is None else self._supply_v
             if not self._dipped and volts < DIP_PART * mean:
                 self._dipped = True
-                self._counts["supply_dips"] += 1
+                self.supply_dips += 1
                 events.append(f"the supply voltage dropped from {mean:.1f} V to {volts:.1f} V")
             elif self._dipped and volts > DIP_OVER_PART * mean:
                 self._dipped = False
@@ -92,7 +87,7 @@ class Plausibility:
             repeats = repeats + 1 if pose == before and moving else 0
             self._poses[sample.source] = pose, repeats
             if repeats == REPEATS:
-                self._counts["poses_frozen"] += 1
+                self.poses_frozen += 1
                 events.append("the measured pose does not change while the wheels turn; check the pose sensor")
         return events
 
