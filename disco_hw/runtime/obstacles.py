@@ -22,6 +22,7 @@ from msgspec import Meta
 from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import MovingCircle
+from drivers.pose.udp import open_udp_port
 from drivers.samples import FARTHEST_M
 
 # Chosen: each takes time of the fence guard and the planner in every tick; further ones are refused.
@@ -156,15 +157,11 @@ def obstacle_source_of(config: RobotConfig) -> UdpObstacles | None:
     if port is None:
         return None
     address = config.fence.obstacles_address
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setblocking(False)
     try:
-        opened.bind((address, port))
+        return UdpObstacles(open_udp_port(address, port))
     except OSError as error:
-        opened.close()
         why = error.strerror or str(error)
         raise InputError(f"robot.toml: fence.obstacles_port: {address}:{port}: {why}; choose another port") from None
-    return UdpObstacles(opened)
 
 
 class UdpObstacles:

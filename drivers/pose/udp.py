@@ -53,6 +53,18 @@ _DECODERS: tuple[Callable[[bytes], _Datagram], ...] = (
 )
 
 
+def open_udp_port(address: str, port: int) -> socket.socket:
+    """Return a UDP socket for the control loop, which receives on this port and never waits. Raises OSError."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    try:
+        opened.bind((address, port))
+    except OSError:
+        opened.close()
+        raise
+    return opened
+
+
 def create_pose_source(
     *,
     address: str = "127.0.0.1",
@@ -73,12 +85,9 @@ def create_pose_source(
         allowed = None if allow is None else parse_allowed(allow)
     except ValueError as error:
         raise PoseSourceError(f"pose.allow: {error}") from None
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setblocking(False)
     try:
-        opened.bind((address, port))
+        opened = open_udp_port(address, port)
     except OSError as error:
-        opened.close()
         reason = error.strerror or str(error)
         raise PoseSourceError(f"{address}:{port}: {reason}; choose another pose.port, or pose.address") from None
     proof = None if key is None else PoseProof(key, time.time_ns())
