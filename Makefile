@@ -51,7 +51,7 @@ test: $(STAMP) chromium
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	sh -c '$(BIN)/mypy && $(BIN)/vulture' & static=$$!; \
-		$(PYTEST) -n 7 --dist each -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
+		$(PYTEST) -n 10 --dist each -m "not long and not thorough$(if $(CHROMIUM), or browser)"; \
 		tests=$$?; wait $$static && exit $$tests
 	@$(TOOK)
 

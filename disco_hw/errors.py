@@ -1,5 +1,15 @@
 """Exceptions for what a user did wrong, and for work that failed."""
 
+from typing import NamedTuple
+
+
+class FieldFault(NamedTuple):
+    """Fault in a section of robot.toml that no single value shows: the field to change, the fault, the remedy."""
+
+    field: str
+    fault: str
+    hint: str
+
 
 class InputError(Exception):
     """Error for wrong input; the message is one line: file, field and remedy; commands exit with 2."""

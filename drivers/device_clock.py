@@ -38,10 +38,9 @@ class DeviceClock:
     Of the last eight exchanges the one with the least round trip is used, since it was delayed least; a Kalman filter
     holds offset and skew, the skew within 200 ppm. Once `synced`, a correction is spread over time (1 ms a second), so
     that time stamps never jump. A device that has restarted is noticed by an offset that no skew explains: then
-    everything starts afresh. The device's clock is taken modulo 2^40 us, as it is on the wire.
+    everything starts afresh. The device's clock is taken modulo 2^40 us, as it is on the wire. `count`: exchanges, one
+    after the other, since the start or the device's last restart.
     """
-
-    __slots__ = ("_base_host_ns", "_base_us", "_count", "_filter", "_last_ns", "_slew_from_ns", "_slew_ns", "_window")
 
     def __init__(self) -> None:
         self._window: deque[_Exchange] = deque(maxlen=WINDOW)
@@ -55,7 +54,7 @@ class DeviceClock:
         """Start afresh with the next exchange."""
         self._window.clear()
         self._filter: _OffsetFilter | None = None
-        self._count = 0
+        self.count = 0
         self._slew_ns = 0.0
 
     def add(self, sent_ns: int, received_ns: int, device_us: int) -> bool:
@@ -77,8 +76,8 @@ class DeviceClock:
             self._start(middle_ns, device_us)
         shown_ns = self._shown(received_ns) if self.synced(received_ns) else None
         # Requests that were under way together waited for the same thing, and agree however wrong they are.
-        if self._count == 0 or sent_ns >= self._last_ns:
-            self._count += 1
+        if self.count == 0 or sent_ns >= self._last_ns:
+            self.count += 1
         self._last_ns = received_ns
         self._window.append(_Exchange(middle_ns, self._deviation(middle_ns, device_us), received_ns - sent_ns))
         best = min(self._window, key=lambda exchange: exchange.round_trip_ns)
@@ -91,12 +90,7 @@ class DeviceClock:
 
     def synced(self, now_ns: int) -> bool:
         """Whether the estimate may be used: enough exchanges, and the last one not too long ago."""
-        return self._count >= SYNCED_AFTER and now_ns - self._last_ns <= HOLDOVER_NS
-
-    @property
-    def count(self) -> int:
-        """Number of exchanges, one after the other, since the start or the device's last restart."""
-        return self._count
+        return self.count >= SYNCED_AFTER and now_ns - self._last_ns <= HOLDOVER_NS
 
     @property
     def skew(self) -> float:
@@ -137,8 +131,6 @@ class DeviceClock:
 
 class _OffsetFilter:
     """Kalman filter of two states: offset (ns, relative to the first exchange) and skew (ns per ns)."""
-
-    __slots__ = ("_host_ns", "_offset_ns", "_p00", "_p01", "_p11", "_used_ns", "skew")
 
     def __init__(self, host_ns: int) -> None:
         self._host_ns = host_ns

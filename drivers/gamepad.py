@@ -6,9 +6,11 @@ takes it away, is noticed at the next poll.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from evdev import AbsInfo, InputDevice, InputEvent
 
 # linux/input-event-codes.h.
 _EV_SYN, _EV_KEY, _EV_ABS = 0, 1, 3
@@ -17,40 +19,6 @@ _SYN_REPORT, _SYN_DROPPED = 0, 3
 
 class GamepadError(Exception):
     """Exception for no usable gamepad; the message is one line that says what to do."""
-
-
-class InputEvent(Protocol):
-    """One input event as evdev has it."""
-
-    type: int
-    code: int
-    value: int
-
-
-class AxisInfo(Protocol):
-    """Present value and range of an axis."""
-
-    value: int
-    min: int
-    max: int
-
-
-class EventDevice(Protocol):
-    """Part of evdev.InputDevice that is used."""
-
-    name: str
-
-    def read(self) -> Iterable[InputEvent]:
-        """Events since the last call; raises BlockingIOError for none, another OSError when the device is gone."""
-
-    def absinfo(self, axis_num: int) -> AxisInfo:
-        """Return the present state of an axis."""
-
-    def active_keys(self) -> list[int]:
-        """Codes of the buttons held now."""
-
-    def close(self) -> None:
-        """Close the input device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +50,11 @@ class Gamepad:
     Raises GamepadError for a mapping with names that the device does not have.
     """
 
-    def __init__(self, device: EventDevice, mapping: GamepadMapping, now_ns: int) -> None:
+    def __init__(self, device: InputDevice[str], mapping: GamepadMapping, now_ns: int) -> None:
         self._device = device
         self._dead_zone = mapping.dead_zone
-        self._forward = (_axis(mapping.forward_axis), _sign(mapping.forward_axis))
-        self._left = (_axis(mapping.left_axis), _sign(mapping.left_axis))
+        self._forward = _axis(mapping.forward_axis)
+        self._left = _axis(mapping.left_axis)
         self._button = _code(mapping.deadman_button, "BTN_")
         self._range: dict[int, tuple[int, int]] = {}
         self._raw: dict[int, float] = {}
@@ -142,7 +110,7 @@ class Gamepad:
 
     def _read_state(self) -> None:
         for code, _ in (self._forward, self._left):
-            info = self._device.absinfo(code)
+            info: AbsInfo = self._device.absinfo(code)
             self._range[code] = (info.min, info.max)
             self._raw[code] = self._share(code, info.value)
         self._deadman = self._button in self._device.active_keys()
@@ -162,7 +130,8 @@ class Gamepad:
 def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepad:
     """Open the gamepad at `path`, or the first one that has the axes and the button; raises GamepadError."""
     evdev = _evdev()
-    axes, button = {_axis(mapping.forward_axis), _axis(mapping.left_axis)}, _code(mapping.deadman_button, "BTN_")
+    axes = {code for code, _ in map(_axis, (mapping.forward_axis, mapping.left_axis))}
+    button = _code(mapping.deadman_button, "BTN_")
     for candidate in [path] if path else evdev.list_devices(writable=False):
         try:
             device = evdev.InputDevice(candidate)
@@ -194,12 +163,9 @@ def _evdev() -> Any:
     return evdev
 
 
-def _axis(name: str) -> int:
-    return _code(name.removeprefix("-"), "ABS_")
-
-
-def _sign(name: str) -> float:
-    return -1.0 if name.startswith("-") else 1.0
+def _axis(name: str) -> tuple[int, float]:
+    """Return the code of an axis and the sign of its values."""
+    return _code(name.removeprefix("-"), "ABS_"), -1.0 if name.startswith("-") else 1.0
 
 
 def _code(name: str, prefix: str) -> int:

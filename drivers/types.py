@@ -38,43 +38,6 @@ from drivers.samples import (
     WheelSample,
 )
 
-__all__ = [
-    "MAX_EXTENDED_ID",
-    "SOURCE_TEXTS",
-    "CyclicFrame",
-    "Driver",
-    "DriverState",
-    "DriverStats",
-    "Exchange",
-    "Frame",
-    "Identity",
-    "Limit",
-    "Limits",
-    "LineQuestions",
-    "LinkState",
-    "MessageSource",
-    "MotorDriver",
-    "MotorSample",
-    "NoSettings",
-    "OutgoingFrame",
-    "PoseSample",
-    "PoseSource",
-    "PowerSample",
-    "Readings",
-    "ReceivedFrame",
-    "Request",
-    "RobotLinkHealth",
-    "RobotStatus",
-    "SafetyCard",
-    "SaidBy",
-    "SettingsFault",
-    "Transport",
-    "TransportStats",
-    "WheelCommand",
-    "WheelSample",
-    "socketcan_id",
-]
-
 SaidBy = Literal["device", "fixed", "robot.toml"]
 """Who says something of a controller: itself, its documents of what cannot be set otherwise, or robot.toml alone."""
 SOURCE_TEXTS: Mapping[SaidBy, str] = MappingProxyType(

@@ -10,6 +10,8 @@ from pathlib import Path
 from cffi import FFI
 
 PACKAGE = Path(__file__).resolve().parent
+SOURCES = tuple(sorted(path.name for path in (PACKAGE / "firmware").glob("*.c")))
+# What Python uses, each after those that it includes; the others only the core's own modules include.
 HEADERS = (
     "disco_robot.h",
     "e2e.h",
@@ -26,44 +28,6 @@ HEADERS = (
     "core.h",
     "pose.h",
     "firmware.h",
-)
-# What only the core's own modules include: its layers, from the bottom up, end with reception.c and firmware.c.
-PRIVATE_HEADERS = (
-    "protocol_constants.h",
-    "quantise.h",
-    "timebase.h",
-    "rejection.h",
-    "host.h",
-    "command.h",
-    "drive.h",
-    "supervisor.h",
-    "telemetry.h",
-    "parameters.h",
-)
-SOURCES = (
-    "disco_robot.c",
-    "e2e.c",
-    "cmac.c",
-    "authentication.c",
-    "wheel_limits.c",
-    "robot_config.c",
-    "states.c",
-    "faults.c",
-    "transmit.c",
-    "serial_framing.c",
-    "slcan.c",
-    "quantise.c",
-    "pose.c",
-    "timebase.c",
-    "rejection.c",
-    "host.c",
-    "command.c",
-    "drive.c",
-    "supervisor.c",
-    "telemetry.c",
-    "parameters.c",
-    "reception.c",
-    "firmware.c",
 )
 _WRAPPER = re.compile(r"^(#.*|extern \"C\" \{|\})$", re.MULTILINE)
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
@@ -84,7 +48,7 @@ def create_ffi() -> FFI:
         "\n".join(f'#include "{header}"' for header in HEADERS),
         sources=[f"firmware_protocol/firmware/{source}" for source in SOURCES],
         include_dirs=["firmware_protocol/firmware"],
-        depends=[f"firmware_protocol/firmware/{header}" for header in (*HEADERS, *PRIVATE_HEADERS)],
+        depends=[f"firmware_protocol/firmware/{path.name}" for path in (PACKAGE / "firmware").glob("*.h")],
         extra_compile_args=["-std=c99"],
         # One file name however it is built, so that no stale extension can shadow a fresh one.
         py_limited_api=True,

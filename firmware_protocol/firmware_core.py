@@ -3,7 +3,7 @@
 import enum
 import math
 import secrets
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import msgspec
@@ -28,13 +28,18 @@ _UINT16 = (0, 0xFFFF)
 _DEFAULT: Any = _lib.disco_config_default(1, 1.0)
 
 
+def _c_name(name: str) -> str:
+    """Return the C core's name of a field of `FirmwareConfig`: without its unit, and durations in microseconds."""
+    for unit in ("_rad_s2", "_rad_s", "_v", "_a", "_c"):
+        if name.endswith(unit):
+            return name.removesuffix(unit)
+    return f"{name.removesuffix('_s')}_us" if name.endswith("_s") else name
+
+
 def _default(name: str) -> float:
     """Return a default as C has it, in the decimal digits that a float carries."""
-    return float(f"{getattr(_DEFAULT, name):.7g}")
-
-
-def _default_s(name: str) -> float:
-    return int(getattr(_DEFAULT, f"{name}_us")) / 1e6
+    value = getattr(_DEFAULT, _c_name(name))
+    return value / 1e6 if isinstance(value, int) else float(f"{value:.7g}")
 
 
 class ResetCause(enum.IntEnum):
@@ -58,28 +63,28 @@ class FirmwareConfig:
 
     ticks_per_rev: int
     max_wheel_speed_rad_s: float
-    max_wheel_acceleration_rad_s2: float = _default("max_wheel_acceleration")
-    stop_deceleration_rad_s2: float = _default("stop_deceleration")
-    still_speed_rad_s: float = _default("still_speed")
-    cycle_s: float = _default_s("cycle")
-    command_timeout_s: float = _default_s("command_timeout")
-    drive_off_timeout_s: float = _default_s("drive_off_timeout")
-    stop_timeout_s: float = _default_s("stop_timeout")
-    host_state_timeout_s: float = _default_s("host_state_timeout")
-    host_forget_timeout_s: float = _default_s("host_forget_timeout")
-    reset_quiet_s: float = _default_s("reset_quiet")
-    under_voltage_v: float = _default("under_voltage")
-    over_voltage_v: float = _default("over_voltage")
-    over_current_a: float = _default("over_current")
-    over_temperature_c: float = _default("over_temperature")
-    stall_current_a: float = _default("stall_current")
-    encoder_check_current_a: float = _default("encoder_check_current")
-    encoder_check_speed_rad_s: float = _default("encoder_check_speed")
-    voltage_debounce_s: float = _default_s("voltage_debounce")
-    current_debounce_s: float = _default_s("current_debounce")
-    temperature_debounce_s: float = _default_s("temperature_debounce")
-    encoder_debounce_s: float = _default_s("encoder_debounce")
-    fault_hold_s: float = _default_s("fault_hold")
+    max_wheel_acceleration_rad_s2: float = _default("max_wheel_acceleration_rad_s2")
+    stop_deceleration_rad_s2: float = _default("stop_deceleration_rad_s2")
+    still_speed_rad_s: float = _default("still_speed_rad_s")
+    cycle_s: float = _default("cycle_s")
+    command_timeout_s: float = _default("command_timeout_s")
+    drive_off_timeout_s: float = _default("drive_off_timeout_s")
+    stop_timeout_s: float = _default("stop_timeout_s")
+    host_state_timeout_s: float = _default("host_state_timeout_s")
+    host_forget_timeout_s: float = _default("host_forget_timeout_s")
+    reset_quiet_s: float = _default("reset_quiet_s")
+    under_voltage_v: float = _default("under_voltage_v")
+    over_voltage_v: float = _default("over_voltage_v")
+    over_current_a: float = _default("over_current_a")
+    over_temperature_c: float = _default("over_temperature_c")
+    stall_current_a: float = _default("stall_current_a")
+    encoder_check_current_a: float = _default("encoder_check_current_a")
+    encoder_check_speed_rad_s: float = _default("encoder_check_speed_rad_s")
+    voltage_debounce_s: float = _default("voltage_debounce_s")
+    current_debounce_s: float = _default("current_debounce_s")
+    temperature_debounce_s: float = _default("temperature_debounce_s")
+    encoder_debounce_s: float = _default("encoder_debounce_s")
+    fault_hold_s: float = _default("fault_hold_s")
     board_id: int = _DEFAULT.board_id
     firmware_version: tuple[int, int, int] = (*_DEFAULT.firmware_version,)
     capabilities: int = _DEFAULT.capabilities
@@ -125,15 +130,15 @@ class FirmwareOutputs(msgspec.Struct, frozen=True, gc=False):
     brake: bool
     limited: bool
     state: str
-    fault: int
-    session: int
-    estop_source: str
-    stop_cause: str
-    blockers: int
-    accepted_commands: int
-    last_command_counter: int
-    rejected_frames: int
-    watchdog_events: int
+    fault: int = 0
+    session: int = 0
+    estop_source: str = "NONE"
+    stop_cause: str = "NONE"
+    blockers: int = 0
+    accepted_commands: int = 0
+    last_command_counter: int = 0
+    rejected_frames: int = 0
+    watchdog_events: int = 0
 
 
 def random_entropy() -> int:
@@ -149,45 +154,13 @@ def _nearest(value: float, unit: float, bounds: tuple[int, int]) -> int:
     return math.floor(min(max(value / unit + 0.5, least), most))
 
 
-def _microseconds(seconds: float) -> int:
-    return round(seconds * 1e6)
-
-
 def _fill_config(target: Any, config: FirmwareConfig) -> None:
     if config.key:
         target.authenticated = True
         target.key = tuple(config.key)
-    for name in ("protocol_major", "capabilities", "firmware_version", "board_id", "dbc_hash", "ticks_per_rev"):
-        setattr(target, name, getattr(config, name))
-    for name, unit in (
-        ("max_wheel_speed", "rad_s"),
-        ("max_wheel_acceleration", "rad_s2"),
-        ("stop_deceleration", "rad_s2"),
-        ("still_speed", "rad_s"),
-        ("under_voltage", "v"),
-        ("over_voltage", "v"),
-        ("over_current", "a"),
-        ("over_temperature", "c"),
-        ("stall_current", "a"),
-        ("encoder_check_current", "a"),
-        ("encoder_check_speed", "rad_s"),
-    ):
-        setattr(target, name, getattr(config, f"{name}_{unit}"))
-    for name in (
-        "cycle",
-        "command_timeout",
-        "drive_off_timeout",
-        "stop_timeout",
-        "host_state_timeout",
-        "host_forget_timeout",
-        "reset_quiet",
-        "voltage_debounce",
-        "current_debounce",
-        "temperature_debounce",
-        "encoder_debounce",
-        "fault_hold",
-    ):
-        setattr(target, f"{name}_us", _microseconds(getattr(config, f"{name}_s")))
+    for name in (each.name for each in fields(config) if each.name != "key"):
+        value, c_name = getattr(config, name), _c_name(name)
+        setattr(target, c_name, round(value * 1e6) if c_name.endswith("_us") else value)
 
 
 class FirmwareCore:

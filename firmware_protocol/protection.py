@@ -16,7 +16,10 @@ import binascii
 import enum
 import re
 import struct
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from firmware_protocol.codec import Codec
 
 # firmware_protocol/README.md: 4-bit counter; as few bad frames as these reject a sender, as few good ones bring it
 # back.
@@ -42,13 +45,6 @@ class EncodedFrame(NamedTuple):
 
     can_id: int
     data: bytes
-
-
-class MessageNames(Protocol):
-    """Part of a codec that proving frames needs."""
-
-    def can_id(self, name: str) -> int:
-        """Return the identifier of a message's frames."""
 
 
 def _crc_table() -> bytes:
@@ -187,7 +183,7 @@ def truncated_mac(key: bytes, nonce: bytes, freshness: int, frame: EncodedFrame)
 class Prover:
     """Proves frames to one robot; pure. Without a nonce from the robot nothing can be proved."""
 
-    def __init__(self, key: bytes, codec: MessageNames) -> None:
+    def __init__(self, key: bytes, codec: Codec) -> None:
         """Create a prover with a `key` of 16 bytes."""
         # The library is loaded here, and not with the first command in the loop.
         aes_cmac(key, b"")

@@ -26,7 +26,23 @@ class LinkFaultError(Exception):
     """A fault that this kind of link cannot have; the message says so in one line."""
 
 
-class RobotLink(Protocol):
+class FaultyLink(Protocol):
+    """Faults of a link; each raises LinkFaultError if the link cannot have it."""
+
+    def unplug(self, until_ns: int) -> None:
+        """Break the line until then."""
+
+    def force_bus_off(self, who: str) -> None:
+        """Put "host" or "robot" into bus-off."""
+
+    def babble(self, frame: Frame) -> None:
+        """Let a further, faulty node send `frame` once."""
+
+    def set_bus_fault(self, fault: BusFault) -> None:
+        """Let `fault` decide what becomes of each frame."""
+
+
+class RobotLink(FaultyLink, Protocol):
     """The robot's end of a link. Never blocks; all times are monotonic nanoseconds that do not go back."""
 
     @property
@@ -51,18 +67,6 @@ class RobotLink(Protocol):
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Queue the robot's frames at the time of the last `advance`; what does not fit is counted and lost."""
-
-    def unplug(self, until_ns: int) -> None:
-        """Break the line until then. Raises LinkFaultError if this link cannot."""
-
-    def force_bus_off(self, who: str) -> None:
-        """Put "host" or "robot" into bus-off. Raises LinkFaultError if this link cannot."""
-
-    def babble(self, frame: Frame) -> None:
-        """Let a further, faulty node send `frame` once. Raises LinkFaultError if this link cannot."""
-
-    def set_bus_fault(self, fault: BusFault) -> None:
-        """Let `fault` decide what becomes of each frame. Raises LinkFaultError if the link is not its own."""
 
     def summary(self) -> str:
         """Counters in one line."""

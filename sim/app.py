@@ -16,7 +16,7 @@ from typing import Literal
 import can
 import serial
 
-from drivers.private_socket import SocketPathError
+from drivers.private_files import SocketPathError
 from drivers.types import ReceivedFrame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim import RobotLink
@@ -25,7 +25,7 @@ from sim.body_dynamics import BodyPose
 from sim.effects import HiddenEffectError, hidden_effects
 from sim.fault_player import BUS_ONLY, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import FaultSchedule, Site
-from sim.hub import HubLink
+from sim.hub import Hub
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.process import CommandSocket, PoseSender, StopSignal, TextRecord
@@ -121,7 +121,7 @@ def run_virtual_robot(options: VirtualRobotOptions) -> int:
         while not stop.requested:
             select.select((*process.filenos(), stop.fileno()), (), (), process.timeout_s())
             process.work()
-        print(f"stopped after {process.robot.now_us / 1e6:.3f} s: {process.link.summary()}", file=sys.stderr)
+        print(f"stopped after {process.robot.plant.now_us / 1e6:.3f} s: {process.link.summary()}", file=sys.stderr)
     return 1 if any(record.error for record in records) else 0
 
 
@@ -192,10 +192,7 @@ class _Process:
 
 def _set_up(options: VirtualRobotOptions, records: list[TextRecord], resources: contextlib.ExitStack) -> _Process:
     if options.faults is not None:
-        if options.board is not None:
-            _check_faults_of_board(options.faults)
-        else:
-            _check_faults(options.faults, options.kind, options.interface)
+        _check_faults(options.faults, options)
     robot = _create_robot(options)
     if isinstance(robot, VendorRobot) and options.pose_address is not None:
         sender = PoseSender(options.pose_address)
@@ -229,28 +226,23 @@ def _open_record(path: Path | None, records: list[TextRecord], resources: contex
     return record
 
 
-def _check_faults(schedule: FaultSchedule, kind: str, interface: str) -> None:
+def _check_faults(schedule: FaultSchedule, options: VirtualRobotOptions) -> None:
     """Refuse what this process, or this kind of link, cannot do."""
-    if kind == "can" and interface != "unixcan":
+    kind, interface, has_board = options.kind, options.interface, options.board is not None
+    if kind == "can" and interface != "unixcan" and not has_board:
         raise OptionError(f"faults: not on {interface}; only on the simulator's own bus (unixcan) or a serial line")
     for fault in schedule.faults:
-        name = fault.kind.name
-        if fault.kind.site is Site.PROCESS and name != "cpu_hog":
-            raise OptionError(f"fault {fault.number}: {name}: other processes are not the simulator's; use tests/hil")
-        if kind == "serial" and name in BUS_ONLY:
-            raise OptionError(
-                f"fault {fault.number}: {name}: a serial line has no such fault; remove it, or use a CAN bus"
-            )
-
-
-def _check_faults_of_board(schedule: FaultSchedule) -> None:
-    for fault in schedule.faults:
-        name, site = fault.kind.name, fault.kind.site
-        if name != "cpu_hog" and (site in (Site.FRAMES, Site.LINK, Site.PROCESS) or name in NOT_OF_BOARDS):
-            raise OptionError(
-                f"fault {fault.number}: {name}: cannot be used with --board, whose link and clock are its own; "
-                "leave it out"
-            )
+        name, site, why = fault.kind.name, fault.kind.site, ""
+        if name == "cpu_hog":
+            continue
+        if has_board and (site in (Site.FRAMES, Site.LINK, Site.PROCESS) or name in NOT_OF_BOARDS):
+            why = "cannot be used with --board, whose link and clock are its own; leave it out"
+        elif site is Site.PROCESS:
+            why = "other processes are not the simulator's; use tests/hil"
+        elif kind == "serial" and not has_board and name in BUS_ONLY:
+            why = "a serial line has no such fault; remove it, or use a CAN bus"
+        if why:
+            raise OptionError(f"fault {fault.number}: {name}: {why}")
 
 
 def _synchronise(robot: BoardRobot, link: RobotLink, options: VirtualRobotOptions) -> None:
@@ -328,7 +320,7 @@ def _open_link(options: VirtualRobotOptions, log: Callable[[str], object] | None
     if options.bitrate <= 0:
         raise OptionError(f"bitrate {options.bitrate}: not positive; give the bus's rate in bit/s")
     if options.interface == "unixcan":
-        return HubLink(Path(options.channel), now_ns, bitrate=options.bitrate, log=log)
+        return Hub(Path(options.channel), now_ns, bitrate=options.bitrate, log=log)
     try:
         return PythonCanLink(options.interface, options.channel, now_ns, bitrate=options.bitrate)
     except (can.CanError, OSError, ValueError, NotImplementedError) as error:

@@ -24,7 +24,7 @@ from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 from sim import LinkFaultError
 from sim.bus import BusFault
 from sim.injected_faults import RobotFaults
-from sim.plant import Plant, TrueState
+from sim.plant import Plant
 from sim.python_can_link import RETRY_NS
 from sim.sensors import PoseMeasurement
 from sim.virtual_robot import sensor_inputs
@@ -53,7 +53,7 @@ class BoardRobot:
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.estop_button = False
-        self.faults: RobotFaults | None = None
+        self.faults = RobotFaults()
         self.about: tuple[int, int] | None = None
         self._setpoints = (0.0, 0.0)
         self._state = (0, 0, 0, 0)
@@ -64,14 +64,9 @@ class BoardRobot:
         self._state_names = tuple(codec.choice_name("SYSTEM_STATE", "state", value) for value in range(256))
 
     @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
-        return self.plant.now_us
-
-    @property
     def silent(self) -> bool:
         """Whether the board has not been heard for so long that its wheels are braked."""
-        return self.now_us - self._received_us >= SILENT_US
+        return self.plant.now_us - self._received_us >= SILENT_US
 
     @property
     def outputs(self) -> FirmwareOutputs:
@@ -81,13 +76,8 @@ class BoardRobot:
         enabled, brake = bool(flags & 1) and not self.silent, bool(flags & 2) or self.silent
         name = self._state_names[state]
         return FirmwareOutputs(
-            left, right, enabled, brake, False, name, fault, self._session, "NONE", "NONE", 0, accepted, 0, 0, 0
+            left, right, enabled, brake, False, name, fault, self._session, accepted_commands=accepted
         )
-
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-        return self.plant.truth
 
     def receive(self, now_us: int, frame: Frame) -> None:
         """One frame of the line; what is not of this line is ignored."""
@@ -107,12 +97,10 @@ class BoardRobot:
         """Move on to robot time `now_us`; return what the board's sensors say then."""
         plant, faults, outputs = self.plant, self.faults, self.outputs
         setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
-        turned = setpoints if faults is None else faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
+        turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
+        poses = faults.poses(now_us, plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake))
         inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
-        if faults is not None:
-            poses = faults.poses(now_us, poses)
-            inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
+        inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
         frames = [_wheels(inputs)] if self._steps % WHEELS_STEPS == 0 else []
         if self._steps % POWER_STEPS == 0:
             frames.append(_power(inputs))
@@ -120,10 +108,6 @@ class BoardRobot:
         for pose in poses:
             frames += _pose(pose, now_us)
         return frames
-
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
-        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
         """Do nothing, because the clock is the board's own, and `sim.app` refuses such a fault."""

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from drivers.kernel_cache import compiled
 from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
-from sim.wheel_dynamics import WheelPieces
+from sim.wheel_dynamics import WheelPieces, parameter_record
 
 # Chosen: slower wheels slip and drift less, so that a robot at rest stays where it is.
 SLIP_ONSET_M_S = 0.05
@@ -28,33 +28,6 @@ ACCELERATION_FILTER_S = 0.02
 # Chosen: limits, so that extreme parameters leave a robot that still moves and turns.
 LARGEST_ACCELERATION_SLIP = 0.6
 LEAST_TURN_LEFT = 0.5
-
-_PARAMETERS = np.dtype(
-    [
-        ("left_radius", "f8"),
-        ("right_radius", "f8"),
-        ("axial_distance", "f8"),
-        ("x_icr", "f8"),
-        ("y_icr", "f8"),
-        ("turn_slip", "f8"),
-        ("saturating_turn_slip", "f8"),
-        ("saturating_turn_slip_rate", "f8"),
-        ("acceleration_slip", "f8"),
-        ("side_slip", "f8"),
-        ("speed_squared_drag", "f8"),
-        ("drift_x", "f8"),
-        ("drift_y", "f8"),
-        ("change_s", "f8"),
-        ("change_track", "f8"),
-        ("change_radius", "f8"),
-        ("ripple", "f8"),
-        ("carpet_track", "f8"),
-        ("carpet_x", "f8"),
-        ("carpet_y", "f8"),
-        ("carpet_radius", "f8"),
-    ],
-    align=True,
-)
 
 _BODY = np.dtype(
     [
@@ -162,33 +135,31 @@ def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray
     change_track, change_s, change_radius = effects.values("surface_change")
     saturating, saturating_rate = effects.values("x_saturating_turn_slip")
     carpet_track, carpet_x, carpet_y, carpet_radius = effects.values("x_carpet_patch")
-    values = {
-        "left_radius": p.wheel_radius_m * (1.0 - asymmetry),
-        "right_radius": p.wheel_radius_m * (1.0 + asymmetry),
-        "axial_distance": p.axial_distance_m,
-        "x_icr": p.x_icr_m,
-        "y_icr": effects.values("lateral_icr")[0],
-        "turn_slip": effects.values("turn_slip")[0],
-        "saturating_turn_slip": saturating,
-        "saturating_turn_slip_rate": saturating_rate,
-        "acceleration_slip": effects.values("acceleration_slip")[0],
-        "side_slip": effects.values("side_slip")[0],
-        "speed_squared_drag": effects.values("x_speed_squared_drag")[0],
-        "drift_x": drift * math.cos(direction),
-        "drift_y": drift * math.sin(direction),
-        "change_s": change_s,
-        "change_track": 1.0 + change_track,
-        "change_radius": 1.0 + change_radius,
-        "ripple": effects.values("x_wheel_ripple")[0],
-        "carpet_track": 1.0 + carpet_track,
-        "carpet_x": carpet_x,
-        "carpet_y": carpet_y,
-        "carpet_radius": carpet_radius,
-    }
-    record = np.zeros(1, dtype=_PARAMETERS)
-    for name, value in values.items():
-        record[name] = value
-    return record
+    return parameter_record(
+        {
+            "left_radius": p.wheel_radius_m * (1.0 - asymmetry),
+            "right_radius": p.wheel_radius_m * (1.0 + asymmetry),
+            "axial_distance": p.axial_distance_m,
+            "x_icr": p.x_icr_m,
+            "y_icr": effects.values("lateral_icr")[0],
+            "turn_slip": effects.values("turn_slip")[0],
+            "saturating_turn_slip": saturating,
+            "saturating_turn_slip_rate": saturating_rate,
+            "acceleration_slip": effects.values("acceleration_slip")[0],
+            "side_slip": effects.values("side_slip")[0],
+            "speed_squared_drag": effects.values("x_speed_squared_drag")[0],
+            "drift_x": drift * math.cos(direction),
+            "drift_y": drift * math.sin(direction),
+            "change_s": change_s,
+            "change_track": 1.0 + change_track,
+            "change_radius": 1.0 + change_radius,
+            "ripple": effects.values("x_wheel_ripple")[0],
+            "carpet_track": 1.0 + carpet_track,
+            "carpet_x": carpet_x,
+            "carpet_y": carpet_y,
+            "carpet_radius": carpet_radius,
+        }
+    )
 
 
 @compiled

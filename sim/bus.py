@@ -93,24 +93,20 @@ _BUS_OFF, _PASSIVE = ErrorState.BUS_OFF, ErrorState.PASSIVE
 class CanBus:
     """The wire and the controllers on it.
 
-    `bitrate` in bit/s; None makes a frame take no time, all else staying the same. `log` gets each frame that ended on
-    the wire, and each error frame, as a candump line. `error_frames` counts the latter, `busy_ns` is the time that the
-    wire was not idle.
+    `bitrate` in bit/s. `log` gets each frame that ended on the wire, and each error frame, as a candump line;
+    `error_frames` counts the latter.
     """
 
     def __init__(
         self,
-        bitrate: int | None = 500_000,
+        bitrate: int = 500_000,
         *,
         fault: BusFault | None = None,
         log: Callable[[str], object] | None = None,
         start_ns: int = 0,
     ) -> None:
-        if bitrate is not None and bitrate <= 0:
-            raise ValueError(f"bitrate must be positive, not {bitrate}")
         self.fault = fault
         self.error_frames = 0
-        self.busy_ns = 0
         self._bitrate = bitrate
         self._log = log
         self._interframe_ns = self._bits_ns(INTERFRAME_BITS)
@@ -143,8 +139,6 @@ class CanBus:
         echo: bool = False,
     ) -> BusNode:
         """Return a new node with room for `capacity` waiting frames; with `echo` it receives its own frames as well."""
-        if capacity < 1:
-            raise ValueError("a node needs room for one frame at least")
         node = BusNode(name, capacity, order, echo)
         self._nodes.append(node)
         return node
@@ -236,7 +230,7 @@ class CanBus:
         return True
 
     def _bits_ns(self, bits: int) -> int:
-        return 0 if self._bitrate is None else -(-bits * _NANOSECONDS // self._bitrate)
+        return -(-bits * _NANOSECONDS // self._bitrate)
 
     def _next_start_ns(self) -> int | None:
         start_ns: int | None = None
@@ -249,12 +243,8 @@ class CanBus:
         """Arbitrate among the heads of the queues and put the winner on the wire."""
         senders = [node for node in self._nodes if node.queue and node.eligible_ns <= now_ns]
         if len(senders) > 1:
-            contenders = senders
-            best = min([node.queue[0][2] for node in contenders])
-            senders = [node for node in contenders if node.queue[0][2] == best]
-            for node in contenders:
-                if node not in senders:
-                    node.arbitrations_lost += 1
+            best = min([node.queue[0][2] for node in senders])
+            senders = [node for node in senders if node.queue[0][2] == best]
         frames = [node.start() for node in senders]
         frame = frames[0]
         outcome = UNHARMED if self.fault is None else self.fault.outcome(now_ns, senders[0].name, frame)
@@ -277,7 +267,6 @@ class CanBus:
             self._count_idle(now_ns)
         end_ns = now_ns + self._bits_ns(bits - INTERFRAME_BITS)
         self._on_wire = _Transmission(end_ns, senders, frame, outcome, error_bit is None and acknowledged, acknowledged)
-        self.busy_ns += self._bits_ns(bits)
 
     def _end(self, transmission: _Transmission) -> None:
         """Count, deliver or requeue after the last bit of a frame or of an error delimiter."""
@@ -349,10 +338,7 @@ class CanBus:
             return
         idle_ns = max(0, now_ns - self._idle_counted_ns)
         self._idle_counted_ns = max(now_ns, self._idle_counted_ns)
-        if self._bitrate is None:
-            self._count_recessive_sequences(RECOVERY_SEQUENCES)
-        else:
-            self._count_recessive_sequences(idle_ns * self._bitrate // (RECESSIVE_SEQUENCE_BITS * _NANOSECONDS))
+        self._count_recessive_sequences(idle_ns * self._bitrate // (RECESSIVE_SEQUENCE_BITS * _NANOSECONDS))
 
     def _count_recessive_sequences(self, count: int) -> None:
         for node in tuple(self._recovering):

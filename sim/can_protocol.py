@@ -154,11 +154,7 @@ def _stuffing_table(bits: int) -> tuple[int, ...]:
 
 
 _CRC_TABLE = _crc_table()
-
-
 _STUFFING_8 = _stuffing_table(8)
-
-
 _STUFFING_7 = _stuffing_table(7)
 
 
@@ -282,8 +278,6 @@ class BusNode:
     refused_full: int = 0
     refused_bus_off: int = 0
     lost_by_bus_off: int = 0
-    arbitrations_lost: int = 0
-    transmit_errors: int = 0
     bus_off_count: int = 0
     queue: list[QueuedFrame] = field(default_factory=list)
     on_wire: QueuedFrame | None = None
@@ -323,7 +317,6 @@ class BusNode:
 
     def count_transmit_error(self, acknowledged: bool) -> CanFrame | None:
         """Requeue the frame and add 8 to `tec`, unless an error-passive node only misses the acknowledgement."""
-        self.transmit_errors += 1
         item, self.on_wire = self.on_wire, None
         if self.state is ErrorState.BUS_OFF or item is None:
             self.lost_by_bus_off += 1

@@ -17,10 +17,6 @@ class HiddenEffectError(ValueError):
     """A hidden effect that does not exist or has an impossible value; the message is one line for the user."""
 
 
-class UnknownEffectError(HiddenEffectError):
-    """No effect has this name; the message lists all names."""
-
-
 @dataclass(frozen=True, slots=True)
 class EffectValue:
     """One number of an effect.
@@ -297,8 +293,8 @@ class HiddenEffects:
 def hidden_effects(effects: Mapping[str, float | Sequence[float]]) -> HiddenEffects:
     """Check effects given as name -> value or values (units of the table).
 
-    Raises UnknownEffectError for a name that is not in `EFFECTS`, HiddenEffectError for a wrong number of values or a
-    value that is not finite or physically impossible.
+    Raises HiddenEffectError for a name that is not in `EFFECTS`, a wrong number of values, or a value that is not
+    finite or physically impossible.
     """
     items = []
     for name, given in effects.items():
@@ -347,7 +343,7 @@ def _spec(name: str) -> EffectSpec:
         return EFFECTS[name]
     except KeyError:
         near = "".join(f"did you mean {one}? " for one in difflib.get_close_matches(name, EFFECTS, n=1))
-        raise UnknownEffectError(f"{name!r} is not an effect; {near}the names are {', '.join(EFFECTS)}") from None
+        raise HiddenEffectError(f"{name!r} is not an effect; {near}the names are {', '.join(EFFECTS)}") from None
 
 
 def _complete(spec: EffectSpec, numbers: tuple[float, ...]) -> tuple[float, ...]:

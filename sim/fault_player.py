@@ -6,13 +6,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from types import TracebackType
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import ResetCause
-from sim import LinkFaultError, RobotLink
+from sim import FaultyLink, LinkFaultError
 from sim.fault_schedule import FaultSchedule, ScheduledFault, Site
-from sim.injected_faults import FrameFaults, RobotFaults
+from sim.injected_faults import FrameFaults
 from sim.virtual_robot import Robot, truth_row
 
 COMMANDS = """\
@@ -33,33 +33,21 @@ BUS_ONLY = ("bus_off", "babble")
 _BUSY = "import os; os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))\nwhile True: pass"
 
 
-class FaultStep(NamedTuple):
-    """Faults that begin and end at one instant."""
-
-    begun: tuple[ScheduledFault, ...]
-    ended: tuple[ScheduledFault, ...]
-
-
-_NOTHING = FaultStep((), ())
-
-
 class FaultTimeline:
-    """Iterator over a schedule; `active` holds the faults in force, `done` says that nothing more will happen."""
+    """Iterator over a schedule; `active` holds the faults in force."""
 
     def __init__(self, schedule: FaultSchedule) -> None:
         self.active: tuple[ScheduledFault, ...] = ()
         self._coming = list(reversed(schedule.faults))
         self._next_ns = self._find_next_ns()
 
-    @property
-    def done(self) -> bool:
-        """Whether all faults are over."""
-        return self._next_ns is None
+    def step(self, now_ns: int) -> tuple[tuple[ScheduledFault, ...], tuple[ScheduledFault, ...]]:
+        """Move on to `now_ns` of the schedule's time; return the faults that have begun and ended since the last step.
 
-    def step(self, now_ns: int) -> FaultStep:
-        """Move on to `now_ns` of the schedule's time; a fault that lasts no time begins and ends in one step."""
+        A fault that lasts no time begins and ends in one step.
+        """
         if self._next_ns is None or now_ns < self._next_ns:
-            return _NOTHING
+            return (), ()
         begun: list[ScheduledFault] = []
         while self._coming and self._coming[-1].begin_ns <= now_ns:
             begun.append(self._coming.pop())
@@ -67,7 +55,7 @@ class FaultTimeline:
         ended = tuple(fault for fault in running if fault.end_ns <= now_ns)
         self.active = tuple(fault for fault in running if fault.end_ns > now_ns)
         self._next_ns = self._find_next_ns()
-        return FaultStep(tuple(begun), ended)
+        return tuple(begun), ended
 
     def _find_next_ns(self) -> int | None:
         times = [fault.end_ns for fault in self.active]
@@ -87,7 +75,7 @@ class FaultPlayer:
         self,
         schedule: FaultSchedule,
         robot: Robot,
-        link: RobotLink,
+        link: FaultyLink,
         start_ns: int,
         report: Callable[[str], object] = lambda _line: None,
         processes: ProcessFaults | None = None,
@@ -100,9 +88,7 @@ class FaultPlayer:
         self._start_ns = start_ns
         self._report = report
         self._processes = processes
-        self._sensors = RobotFaults()
         self._unplug_until_ns = 0
-        robot.faults = self._sensors
         link.set_bus_fault(self.frames)
 
     def step(self, now_ns: int) -> tuple[tuple[ScheduledFault, ...], tuple[ScheduledFault, ...]]:
@@ -111,7 +97,7 @@ class FaultPlayer:
         if begun or ended:
             active = self.timeline.active
             self.frames.set_active(active)
-            self._sensors.set_active(active, begun)
+            self._robot.faults.set_active(active, begun)
             for fault in begun:
                 self._report(f"fault {fault.number} begins: {fault}")
                 self._begin(fault, now_ns)
@@ -172,8 +158,7 @@ class FaultPlayer:
 class Injection:
     """Executes `COMMANDS` on a robot and its link, and keeps up what goes on over time."""
 
-    def __init__(self, robot: Robot, link: RobotLink) -> None:
-        self.refused = 0
+    def __init__(self, robot: Robot, link: FaultyLink) -> None:
         self._robot = robot
         self._link = link
         self._babble: Frame | None = None
@@ -199,7 +184,6 @@ class Injection:
                 raise CommandError(f"{name!r} is not a command; write one of {', '.join(self._handlers)}")
             return handler(arguments, now_ns)
         except (CommandError, LinkFaultError) as error:
-            self.refused += 1
             return f"error: {error}"
 
     def step(self, now_ns: int) -> None:
@@ -231,7 +215,7 @@ class Injection:
     def _kidnap(self, arguments: list[str], _now_ns: int) -> str:
         _expect("kidnap", arguments, 3, 3)
         dx_m, dy_m, dyaw_rad = (_number("kidnap", argument, -1000.0, 1000.0) for argument in arguments)
-        self._robot.kidnap(dx_m, dy_m, dyaw_rad)
+        self._robot.plant.kidnap(dx_m, dy_m, dyaw_rad)
         return "ok"
 
     def _start_babble(self, arguments: list[str], now_ns: int) -> str:

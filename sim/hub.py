@@ -1,7 +1,7 @@
 """The simulated CAN bus between processes, in real time: a client of a Unix socket is a node on it.
 
-Each packet on the socket is one Linux `struct can_frame`. Without threads: the owner waits on `fileno()` and
-`next_event_ns()` and calls `pump`. `HubLink` is the virtual robot on a hub that its own process serves to others.
+Each packet on the socket is one Linux `struct can_frame`. Without threads: the owner waits on `filenos()` and
+`next_event_ns()` and calls `collect` and `advance`.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from drivers.private_socket import bind_private
+from drivers.private_files import bind_private
 from drivers.types import Frame, ReceivedFrame
 from sim import LinkFaultError, RobotNode
-from sim.bus import BusFault, CanBus, DeliveredFrame
+from sim.bus import BusFault, CanBus
 from sim.can_protocol import (
     ECHO_OWN_FRAMES,
     FRAME_BYTES,
@@ -32,10 +32,6 @@ from sim.can_protocol import (
 CLIENT_TRANSMIT_QUEUE = 32
 READER_QUEUE = 1024
 """Frames kept for a client that does not read, beyond the kernel's 280 or so; more are dropped and counted."""
-READER_QUEUE_PAUSE = 256
-"""Unpaced only: with more than this waiting for a reader that still reads, nobody may send."""
-READER_STALL_NS = 100_000_000
-"""Unpaced only: a reader that took nothing for so long holds up nobody."""
 
 
 @dataclass(slots=True)
@@ -57,15 +53,14 @@ class _Client:
     unread: deque[bytes] = field(default_factory=deque)
     lost_unread: int = 0
     unsent: int = 0
-    last_read_ns: int = 0
 
 
 class Hub:
-    """The bus, the clients' nodes on it, and the socket through which clients come and go.
+    """The bus with the robot and the clients as its nodes, and the socket at `path` through which clients come and go.
 
-    `pacing` makes each frame take its time on the wire at `bitrate`; without it a frame takes none, and readers slow
-    the senders down instead of losing frames. Clients send in the order in which they wrote. A silent node acknowledges
-    all frames, so that a lone node is not without an answer. Raises SocketPathError if it cannot listen at `path`.
+    Satisfies `sim.RobotLink`. Clients send in the order in which they wrote. A silent node acknowledges all frames, so
+    that a lone node is not without an answer. `log` gets a line for every frame on the bus, as candump writes it.
+    Raises SocketPathError if it cannot listen.
     """
 
     def __init__(
@@ -74,15 +69,13 @@ class Hub:
         now_ns: int,
         *,
         bitrate: int = 500_000,
-        pacing: bool = True,
-        fault: BusFault | None = None,
         log: Callable[[str], object] | None = None,
     ) -> None:
         self.path = path
-        self.bus = CanBus(bitrate if pacing else None, fault=fault, log=log, start_ns=now_ns)
+        self.bus = CanBus(bitrate, log=log, start_ns=now_ns)
         self.bus.attach("monitor")
+        self.robot = RobotNode(self.bus)
         self.stats = HubStats()
-        self._pacing = pacing
         self._now_ns = now_ns
         self._epoll = select.epoll()
         self._listener: socket.socket | None = None
@@ -93,23 +86,24 @@ class Hub:
         self._inbox: deque[tuple[_Client, CanFrame]] = deque()
         self._listen()
 
-    def fileno(self) -> int:
-        """Descriptor that is readable when a client has done something."""
-        return self._epoll.fileno()
+    @property
+    def address(self) -> str:
+        """Address of the hub's socket."""
+        return f"unixcan {self.path}"
+
+    @property
+    def error_counters(self) -> tuple[int, int]:
+        """Error counters of the robot's node; the first is 256 at bus-off."""
+        return self.robot.error_counters
+
+    def filenos(self) -> list[int]:
+        """Return the descriptor that is readable when a client has done something."""
+        return [self._epoll.fileno()]
 
     def next_event_ns(self) -> int | None:
-        """Return when `pump` is due even if no client does anything; None if never."""
-        times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns) if t is not None]
-        times.extend(client.last_read_ns + READER_STALL_NS for client in self._slow_readers())
+        """Return when a frame ends, a restart is due, or clients may come back; None if never."""
+        times = [t for t in (self.bus.next_event_ns(), self._plug_in_ns, self.robot.restart_ns) if t is not None]
         return min(times) if times else None
-
-    def pump(self, now_ns: int) -> list[DeliveredFrame]:
-        """Take in what clients wrote, let the bus run up to `now_ns`, and hand out what was received; never blocks.
-
-        Returns the deliveries, for nodes that the owner has attached to `bus` itself.
-        """
-        self.collect(now_ns)
-        return self.advance(now_ns)
 
     def collect(self, now_ns: int) -> int:
         """Read and write all sockets; return how many frames of clients now wait to be let onto the bus."""
@@ -129,8 +123,11 @@ class Hub:
         self._set_events()
         return len(self._inbox)
 
-    def advance(self, now_ns: int, admit: int | None = None) -> list[DeliveredFrame]:
-        """Let the oldest `admit` waiting frames (None: all) onto the bus and run it up to `now_ns`."""
+    def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
+        """Let the oldest `admit` waiting frames (None: all) onto the bus and run it up to `now_ns`.
+
+        Returns the data frames that the robot's controller has received.
+        """
         deliveries = self.bus.advance(now_ns)
         for _ in range(len(self._inbox) if admit is None else admit):
             client, frame = self._inbox.popleft()
@@ -143,7 +140,11 @@ class Hub:
             self._leaving.remove(client)
             self.bus.detach(client.node)
         self._set_events()
-        return deliveries
+        return self.robot.take(now_ns, deliveries)
+
+    def send(self, frames: Sequence[Frame]) -> None:
+        """Queue the robot's frames; the node counts those that do not fit."""
+        self.robot.send(frames)
 
     def unplug(self, until_ns: int) -> None:
         """Cut off all clients, with what they have not sent yet, and refuse new ones until `until_ns`."""
@@ -159,10 +160,28 @@ class Hub:
             self.path.unlink(missing_ok=True)
         self._plug_in_ns = until_ns
 
-    def force_clients_bus_off(self) -> None:
-        """Put the controller of each client into bus-off; a client gets a new one by connecting anew."""
-        for client in self._clients.values():
-            self.bus.force_bus_off(client.node)
+    def force_bus_off(self, who: str) -> None:
+        """Put all clients ("host") or the robot ("robot") into bus-off; a client that connects anew is out of it."""
+        if who not in ("host", "robot"):
+            raise LinkFaultError(f"bus_off {who}: say host or robot")
+        for node in tuple(self._by_node) if who == "host" else (self.robot.node,):
+            self.bus.force_bus_off(node)
+
+    def babble(self, frame: Frame) -> None:
+        """Send `frame` from a third node; if its queue is full it is on the bus as often as the bus allows."""
+        self.robot.babble(frame)
+
+    def set_bus_fault(self, fault: BusFault) -> None:
+        """Let `fault` decide what becomes of each frame."""
+        self.bus.fault = fault
+
+    def summary(self) -> str:
+        """Counters in one line."""
+        robot = self.robot.node
+        return (
+            f"{self.stats} robot: sent={robot.sent} received={robot.received} full={robot.refused_full} "
+            f"bus_off={robot.bus_off_count} error_frames={self.bus.error_frames}"
+        )
 
     def close(self) -> None:
         """Close all connections and remove the socket; safe to call twice."""
@@ -229,13 +248,12 @@ class Hub:
                 client.lost_unread += 1
                 self.stats.reader_overflow += 1
                 continue
-            was_read = not client.unread
+            was_empty = not client.unread
             if client.lost_unread:
                 client.unread.append(pack_frame(receive_overflow_frame()))
                 client.lost_unread = 0
             client.unread.append(packet)
-            if was_read:
-                client.last_read_ns = self._now_ns
+            if was_empty:
                 self._flush(client)
 
     def _flush(self, client: _Client) -> None:
@@ -249,25 +267,13 @@ class Hub:
                 client.unread.clear()
                 return
             client.unread.popleft()
-            client.last_read_ns = self._now_ns
             self.stats.frames_out += 1
-
-    def _slow_readers(self) -> list[_Client]:
-        """Return the clients whose full queues make the senders wait."""
-        if self._pacing:
-            return []
-        return [
-            client
-            for client in self._clients.values()
-            if len(client.unread) > READER_QUEUE_PAUSE and self._now_ns - client.last_read_ns < READER_STALL_NS
-        ]
 
     def _set_events(self) -> None:
         """Listen only to what can be served now, or a level-triggered poll would spin."""
-        must_wait = bool(self._slow_readers())
         for descriptor, client in self._clients.items():
             room = client.unsent + client.node.pending < CLIENT_TRANSMIT_QUEUE
-            events = select.EPOLLIN if room and not must_wait else 0
+            events = select.EPOLLIN if room else 0
             if client.unread:
                 events |= select.EPOLLOUT
             if events != client.events:
@@ -280,87 +286,3 @@ class Hub:
         del self._by_node[client.node]
         client.connection.close()
         self._leaving.append(client)
-
-
-class HubLink:
-    """A hub at `path` with the robot as a node; satisfies `sim.RobotLink`.
-
-    `log` gets a line for every frame on the bus, as candump writes it. Raises SocketPathError if the hub cannot listen.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        now_ns: int,
-        *,
-        bitrate: int = 500_000,
-        pacing: bool = True,
-        log: Callable[[str], object] | None = None,
-    ) -> None:
-        self.hub = Hub(path, now_ns, bitrate=bitrate, pacing=pacing, log=log)
-        self._robot = RobotNode(self.hub.bus)
-        self.robot = self._robot.node
-
-    @property
-    def address(self) -> str:
-        """Address of the hub's socket."""
-        return f"unixcan {self.hub.path}"
-
-    @property
-    def error_counters(self) -> tuple[int, int]:
-        """Error counters of the robot's node; the first is 256 at bus-off."""
-        return self._robot.error_counters
-
-    def filenos(self) -> list[int]:
-        """Return the hub's epoll descriptor."""
-        return [self.hub.fileno()]
-
-    def next_event_ns(self) -> int | None:
-        """Return when a frame ends, a restart is due, or clients may come back."""
-        times = [t for t in (self.hub.next_event_ns(), self._robot.restart_ns) if t is not None]
-        return min(times) if times else None
-
-    def collect(self, now_ns: int) -> int:
-        """Read and write all sockets of the hub; return how many frames wait to be let onto the bus."""
-        return self.hub.collect(now_ns)
-
-    def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
-        """Run the bus up to `now_ns`; return the data frames that the robot's controller has received."""
-        return self._robot.take(now_ns, self.hub.advance(now_ns, admit))
-
-    def send(self, frames: Sequence[Frame]) -> None:
-        """Queue the robot's frames; the node counts those that do not fit."""
-        self._robot.send(frames)
-
-    def unplug(self, until_ns: int) -> None:
-        """Cut off all clients and refuse new ones until then."""
-        self.hub.unplug(until_ns)
-
-    def force_bus_off(self, who: str) -> None:
-        """Put all clients ("host") or the robot's controller ("robot") into bus-off."""
-        if who == "host":
-            self.hub.force_clients_bus_off()
-        elif who == "robot":
-            self.hub.bus.force_bus_off(self.robot)
-        else:
-            raise LinkFaultError(f"bus_off {who}: say host or robot")
-
-    def babble(self, frame: Frame) -> None:
-        """Send `frame` from a third node; if its queue is full it is on the bus as often as the bus allows."""
-        self._robot.babble(frame)
-
-    def set_bus_fault(self, fault: BusFault) -> None:
-        """Let `fault` decide what becomes of each frame."""
-        self.hub.bus.fault = fault
-
-    def summary(self) -> str:
-        """Counters in one line."""
-        robot = self.robot
-        return (
-            f"{self.hub.stats} robot: sent={robot.sent} received={robot.received} full={robot.refused_full} "
-            f"bus_off={robot.bus_off_count} error_frames={self.hub.bus.error_frames}"
-        )
-
-    def close(self) -> None:
-        """Close the hub and remove its socket."""
-        self.hub.close()

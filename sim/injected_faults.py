@@ -141,6 +141,8 @@ class RobotFaults:
 
     def setpoints(self, left_rad_s: float, right_rad_s: float, *, is_driven: bool) -> tuple[float, float]:
         """Return what the motors make of the setpoints (rad/s); one runs away only while its controller drives it."""
+        if not self.active:
+            return left_rad_s, right_rad_s
         stalled, runaway = self._by_wheel["motor_stall"], self._by_wheel["motor_runaway"]
         made = {"left": left_rad_s, "right": right_rad_s}
         for side in stalled:

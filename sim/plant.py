@@ -20,7 +20,7 @@ from drivers.kernel_cache import compiled
 from sim.body_dynamics import Body, BodyPose
 from sim.effects import HiddenEffects
 from sim.plant_parameters import PlantParameters
-from sim.sensors import Battery, Electrics, Encoders, PoseMeasurement, SampledPoseSensor, wrapped
+from sim.sensors import Electrics, Encoders, PoseMeasurement, SampledPoseSensor, wrapped
 from sim.wheel_dynamics import WheelMotors
 
 # Chosen: random numbers are drawn for so many cells at once; more wait longer for each block.
@@ -49,7 +49,7 @@ class TrueState(msgspec.Struct, frozen=True, gc=False):
 
 
 class Plant:
-    """A skid-steer robot with hidden effects.
+    """A skid-steer robot with hidden effects; `electrics` are the readings of its battery and motors.
 
     `effects`: from `sim.effects.hidden_effects`. `seed` decides all disturbances and noise. Plant time starts at 0 us
     with the robot at rest at `start`.
@@ -70,7 +70,7 @@ class Plant:
         self._encoders = Encoders(self.parameters, self.effects)
         self._body = Body(self.parameters, self.effects, start or BodyPose())
         self._pose_sensor = SampledPoseSensor(self.parameters, self.effects, pose_seed)
-        self._electrics = Electrics(self.parameters, self.effects)
+        self.electrics = Electrics(self.parameters, self.effects)
         self._step_us = self.parameters.integration_step_us
         self._delay_us = round(self.effects.values("command_delay")[0] * 1e6)
         self._now_us = 0
@@ -93,21 +93,6 @@ class Plant:
     def measured_wheel_speeds_rad_s(self) -> tuple[float, float]:
         """Wheel speeds that the controller makes of the ticks, left and right."""
         return self._encoders.speeds_rad_s
-
-    @property
-    def motor_currents_a(self) -> tuple[float, float]:
-        """Motor currents, left and right; positive drives forward."""
-        return self._electrics.motor_currents_a
-
-    @property
-    def motor_temperatures_c(self) -> tuple[float, float]:
-        """Motor temperatures, left and right."""
-        return self._electrics.motor_temperatures_c
-
-    @property
-    def battery(self) -> Battery:
-        """Voltage, current and temperature of the battery."""
-        return self._electrics.battery
 
     @property
     def truth(self) -> TrueState:
@@ -180,7 +165,7 @@ class Plant:
                 if measurement is not None:
                     bisect.insort(self._poses, measurement, key=_available_us)
         if until_us % ELECTRICS_STEP_US == 0:
-            self._electrics.advance(until_us * 1e-6, ELECTRICS_STEP_US * 1e-6, wheels.torques_nm, wheels.speeds_rad_s)
+            self.electrics.advance(until_us * 1e-6, ELECTRICS_STEP_US * 1e-6, wheels.torques_nm, wheels.speeds_rad_s)
         self._now_us = until_us
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, TextIO
 
-from drivers.private_socket import bind_private
+from drivers.private_files import bind_private
 
 if TYPE_CHECKING:
     # Brings the compiler of the simulation's kernels, for which a command that is sent need not wait.
@@ -112,7 +112,6 @@ class CommandSocket:
     """Takes commands at `path`; raises SocketPathError if it cannot."""
 
     def __init__(self, path: Path) -> None:
-        self.lost_replies = 0
         self._path = path
         self._socket = bind_private(path, socket.SOCK_DGRAM)
 
@@ -130,10 +129,9 @@ class CommandSocket:
             reply = execute(text.decode("utf-8", errors="replace").strip())
             if not sender:
                 continue
-            try:
+            # Whoever asked may be gone by now.
+            with contextlib.suppress(OSError):
                 self._socket.sendto(reply.encode(), sender)
-            except OSError:
-                self.lost_replies += 1
 
     def close(self) -> None:
         """Close and remove the socket; safe to call twice."""

@@ -18,8 +18,6 @@ from sim.bus import BusFault
 RETRY_NS = 500_000_000
 # Chosen: a flood of frames must not hold up the plant's steps.
 MAX_FRAMES_PER_READ = 64
-# Chosen: as the robot's own.
-GUEST_QUEUE = 64
 
 
 class PythonCanLink:

@@ -54,11 +54,11 @@ class SerialLine:
     """The robot's end of the line; satisfies `sim.RobotLink`.
 
     `path` becomes a symbolic link to the port that a host opens; None leaves the port under its own name (`port`).
-    `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit); `pacing` off makes bytes take no time.
+    `baud` is the robot's rate in bit/s (8 data bits, no parity, 1 stop bit).
     `log` gets a line for each frame whose last bit has passed, in either direction, as candump writes it.
     `framed`: whether the line carries frames in the reference protocol's framing; otherwise what comes goes on as it
-    is, each piece as the data of a frame.
-    Raises SerialPathError if `path` is taken by anything but a link to a terminal, ValueError for an impossible rate.
+    is, each piece as the data of a frame. `connected`: whether a host has the port open.
+    Raises SerialPathError if `path` is taken by anything but a link to a terminal.
     """
 
     def __init__(
@@ -67,16 +67,13 @@ class SerialLine:
         now_ns: int,
         *,
         baud: int = 921_600,
-        pacing: bool = True,
         log: Callable[[str], object] | None = None,
         framed: bool = True,
     ) -> None:
-        if baud <= 0:
-            raise ValueError(f"baud must be positive, not {baud}")
         self.stats = SerialLineStats()
         self._path = path
         self._baud = baud
-        self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // baud if pacing else 0
+        self._byte_ns = BITS_PER_BYTE * 1_000_000_000 // baud
         self._now_ns = now_ns
         self._plug_in_ns: int | None = None
         self._noise = random.Random(0)
@@ -86,7 +83,7 @@ class SerialLine:
         self._to_robot: deque[ReceivedFrame] = deque()
         self._to_host: deque[tuple[int, bytes, Frame]] = deque()
         self._master = -1
-        self._connected = False
+        self.connected = False
         self._fault: BusFault | None = None
         self._log = log
         self._poll = select.poll()
@@ -99,18 +96,13 @@ class SerialLine:
         return f"serial {self._path or self.port} at {self._baud} Bd"
 
     @property
-    def connected(self) -> bool:
-        """Whether a host has the port open."""
-        return self._connected
-
-    @property
     def error_counters(self) -> tuple[int, int]:
         """A serial line has none."""
         return 0, 0
 
     def filenos(self) -> list[int]:
         """Return the terminal while a host has it open: a closed one stays readable for ever."""
-        return [self._master] if self._connected else []
+        return [self._master] if self.connected else []
 
     def next_event_ns(self) -> int | None:
         """Return when the next frame has passed or the line is plugged in again."""
@@ -131,8 +123,8 @@ class SerialLine:
             if flags & select.POLLIN:
                 # Also after the host has closed: what it wrote before, an e-stop perhaps, is on the line.
                 self._read()
-            if bool(flags & _HANG_UP) == self._connected:
-                self._set_connected(not self._connected)
+            if bool(flags & _HANG_UP) == self.connected:
+                self._set_connected(not self.connected)
         return len(self._waiting)
 
     def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
@@ -161,7 +153,7 @@ class SerialLine:
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Put the robot's frames on the line, one after the other."""
-        if not self._connected:
+        if not self.connected:
             return
         for frame in frames:
             outcome = self._outcome(ROBOT_NODE, frame)
@@ -227,7 +219,7 @@ class SerialLine:
             self._create_link(self._path)
 
     def _set_connected(self, connected: bool) -> None:
-        self._connected = connected
+        self.connected = connected
         if connected:
             self.stats.opened += 1
             return

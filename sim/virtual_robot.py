@@ -31,32 +31,21 @@ from sim.sensors import PoseMeasurement
 
 
 class Robot(Protocol):
-    """Satisfied by `VirtualRobot` and `VendorRobot`; pure, stepped at 1 kHz."""
+    """A plant with its controller, at the plant's time; pure, stepped at 1 kHz."""
 
     plant: Plant
     estop_button: bool
-    faults: RobotFaults | None
-
-    @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
+    faults: RobotFaults
 
     @property
     def outputs(self) -> FirmwareOutputs:
         """Outputs of the controller in the last cycle."""
-
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
 
     def receive(self, now_us: int, frame: Frame) -> None:
         """One frame from the link, at robot time `now_us`."""
 
     def step(self, now_us: int, error_counters: tuple[int, int] = (0, 0)) -> Sequence[Frame]:
         """Move on to robot time `now_us`; return the frames that the controller sends, in order."""
-
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off."""
 
     def jump_clock(self, step_us: int) -> None:
         """Set the controller's clock."""
@@ -71,9 +60,9 @@ def sensor_inputs(
     """Return the inputs of a controller now: its sensors, button, and link (transmit and receive errors)."""
     left_ticks, right_ticks = plant.encoder_ticks
     left_speed, right_speed = plant.measured_wheel_speeds_rad_s
-    left_current, right_current = plant.motor_currents_a
-    left_temperature, right_temperature = plant.motor_temperatures_c
-    battery = plant.battery
+    left_current, right_current = plant.electrics.motor_currents_a
+    left_temperature, right_temperature = plant.electrics.motor_temperatures_c
+    battery = plant.electrics.battery
     return FirmwareInputs(
         left_ticks=left_ticks,
         right_ticks=right_ticks,
@@ -148,31 +137,21 @@ class VendorRobot:
         self.plant = plant
         self.controller = controller
         self.estop_button = False
-        self.faults: RobotFaults | None = None
+        self.faults = RobotFaults()
         self.pose_sink = pose_sink
         self._coasting = [0.0, 0.0]
         self._loop = controller.create_loop()
         self._replies: list[CanFrame] = []
 
     @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
-        return self.plant.now_us
-
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-        return self.plant.truth
-
-    @property
     def outputs(self) -> FirmwareOutputs:
         """Outputs of the controller now, in the terms of the reference firmware."""
         left, right = self.controller.wheels_rad_s
         driven = left is not None or right is not None
+        state, accepted = self.controller.state, self.controller.obeyed
         return FirmwareOutputs(
-            left or 0.0, right or 0.0, driven, self.controller.brakes, False, self.controller.state, 0, 0, "NONE",
-            "NONE", self.controller.obeyed, 0, 0, 0, 0,
-        )  # fmt: skip
+            left or 0.0, right or 0.0, driven, self.controller.brakes, False, state, accepted_commands=accepted
+        )
 
     def receive(self, now_us: int, frame: Frame) -> None:
         """One frame from the link, at robot time `now_us`; the replies leave with the next step."""
@@ -183,27 +162,19 @@ class VendorRobot:
         plant, faults = self.plant, self.faults
         wheels, regulates = self.controller.wheels_rad_s, self.controller.regulates
         setpoints = self._setpoints(wheels)
-        turned = self._loop.drive(setpoints) if regulates else setpoints
-        if faults is not None:
-            turned = faults.setpoints(*turned, is_driven=regulates)
+        driven = self._loop.drive(setpoints) if regulates else setpoints
+        turned = faults.setpoints(*driven, is_driven=regulates)
         enabled = wheels != (None, None)
         dt_s = 1e-6 * (now_us - plant.now_us)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, enabled, self.controller.brakes)
-        if faults is not None:
-            poses = faults.poses(now_us, poses)
+        poses = faults.poses(now_us, plant.step(now_us, *turned, enabled, self.controller.brakes))
         if self.pose_sink is not None:
             for pose in poses:
                 self.pose_sink(pose, now_us)
-        inputs = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
-        if faults is not None:
-            true, inputs = inputs, faults.inputs(inputs, setpoints, enabled)
-            self._loop.see(setpoints, true, inputs, dt_s, regulates)
+        true = sensor_inputs(plant, self.estop_button, error_counters, ResetCause.POWER_ON)
+        inputs = faults.inputs(true, setpoints, enabled)
+        self._loop.see(setpoints, true, inputs, dt_s, regulates)
         frames, self._replies = [*self._replies, *self.controller.step(now_us, inputs)], []
         return [Frame(frame.can_id, frame.data, frame.extended) for frame in frames]
-
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
-        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
 
     def jump_clock(self, step_us: int) -> None:
         """Do nothing, because these controllers send no time."""
@@ -232,7 +203,7 @@ class VendorRobot:
 STEP_US = 1000
 # Chosen: keeps the controller's clock away from 0, before which it has no times.
 EARLIEST_JUMP_US = 10_000_000
-_RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT", 0, 0, "NONE", "NONE", 0, 0, 0, 0, 0)
+_RELEASED = FirmwareOutputs(0.0, 0.0, False, True, False, "BOOT")
 TRUTH_COLUMNS = (
     "t_ns",
     "x_m",
@@ -272,7 +243,7 @@ class VirtualRobot:
 
     Robot time is true microseconds since the robot was switched on, the plant's time. The motor driver takes the
     firmware's setpoints, its enable and its brake one cycle later. `estop_button` is the state of the button on the
-    robot; `faults`, if there is one, stands between plant and firmware. At each start the controller draws its
+    robot; `faults` stands between plant and firmware. At each start the controller draws its
     challenges from the system's entropy, as a real one must; with a `challenge_seed` every run has the same ones, and
     whoever has recorded one run can replay it in the next: for tests alone.
     """
@@ -286,7 +257,7 @@ class VirtualRobot:
     ) -> None:
         self.plant = plant
         self.estop_button = False
-        self.faults: RobotFaults | None = None
+        self.faults = RobotFaults()
         self._config = config
         self._clock = clock or ControllerClock()
         self._clock_start_us = 0
@@ -297,11 +268,6 @@ class VirtualRobot:
         self._outputs = _RELEASED
 
     @property
-    def now_us(self) -> int:
-        """Robot time of the last step."""
-        return self.plant.now_us
-
-    @property
     def outputs(self) -> FirmwareOutputs:
         """Outputs of the firmware in the last cycle."""
         return self._outputs
@@ -310,11 +276,6 @@ class VirtualRobot:
     def firmware(self) -> FirmwareCore:
         """The controller's program, for its counters."""
         return self._firmware
-
-    @property
-    def truth(self) -> TrueState:
-        """The plant's true state at the last step."""
-        return self.plant.truth
 
     def device_us(self, robot_us: int) -> int:
         """Return the time (us) of the controller's clock at robot time `robot_us`."""
@@ -334,13 +295,9 @@ class VirtualRobot:
         """
         plant = self.plant
         outputs, faults = self._outputs, self.faults
-        setpoints = turned = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
-        if faults is not None:
-            turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
-        poses: Sequence[PoseMeasurement] = plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)
-        if faults is not None:
-            poses = faults.poses(now_us, poses)
-        for pose in poses:
+        setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
+        turned = faults.setpoints(*setpoints, is_driven=outputs.driver_enabled)
+        for pose in faults.poses(now_us, plant.step(now_us, *turned, outputs.driver_enabled, outputs.brake)):
             if pose.sample_us < self._clock_start_us:
                 # The controller's clock has no name for a time before it started.
                 continue
@@ -348,18 +305,13 @@ class VirtualRobot:
                 pose.x_m, pose.y_m, pose.yaw_rad, self.device_us(pose.sample_us), pose.position_std_m, pose.yaw_std_rad
             )
         inputs = sensor_inputs(plant, self.estop_button, error_counters, self._reset_cause)
-        if faults is not None:
-            inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
+        inputs = faults.inputs(inputs, setpoints, outputs.driver_enabled)
         self._outputs = self._firmware.step(self.device_us(now_us), inputs)
         return [Frame(can_id, data) for can_id, data in self._firmware.drain()]
 
-    def kidnap(self, dx_m: float, dy_m: float, dyaw_rad: float) -> None:
-        """Carry the robot off: a step in the world frame and a turn about the tracked point, wheels untouched."""
-        self.plant.kidnap(dx_m, dy_m, dyaw_rad)
-
     def jump_clock(self, step_us: int) -> None:
         """Set the controller's clock forward, or back, though never to before its tenth second."""
-        largest_us = max(0, self.device_us(self.now_us) - EARLIEST_JUMP_US)
+        largest_us = max(0, self.device_us(self.plant.now_us) - EARLIEST_JUMP_US)
         self._clock = ControllerClock(self._clock.start_us + max(step_us, -largest_us), self._clock.skew_ppm)
 
     def reboot(self, cause: ResetCause = ResetCause.POWER_ON) -> None:
@@ -380,7 +332,7 @@ class VirtualRobot:
 
 def truth_row(robot: Robot, t_ns: int) -> str:
     """Return the values of `TRUTH_COLUMNS` at the last step, at the monotonic time `t_ns`, separated by commas."""
-    truth, outputs = robot.truth, robot.outputs
+    truth, outputs = robot.plant.truth, robot.outputs
     return (
         f"{t_ns},{truth.x_m:.6f},{truth.y_m:.6f},{truth.yaw_rad:.6f},"
         f"{truth.left_speed_rad_s:.5f},{truth.right_speed_rad_s:.5f},"
@@ -434,7 +386,7 @@ class RobotInProcess:
     @property
     def truth(self) -> TrueState:
         """The true state of the plant now."""
-        return self.board.truth
+        return self.board.plant.truth
 
     def advance(self, until_us: int) -> None:
         """Let time pass until then; frames wait at both ends."""

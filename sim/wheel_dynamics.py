@@ -9,6 +9,7 @@ response is the profile itself. The motors are regulated by sensors of their own
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,51 +28,9 @@ LOAD_ONSET_RAD_S = 0.5
 
 Floats = npt.NDArray[np.float64]
 
-_PARAMETERS = np.dtype(
-    [
-        ("step_us", "i8"),
-        ("tau", "f8"),
-        ("second_order_frequency", "f8"),
-        ("second_order_damping", "f8"),
-        ("acceleration_limit", "f8"),
-        ("stop_limit", "f8"),
-        ("inertia", "f8"),
-        ("viscous", "f8"),
-        ("dry", "f8"),
-        ("turning_load", "f8"),
-        ("torque_limit", "f8"),
-        ("gain", "f8"),
-        ("integral_gain", "f8"),
-        ("brake_rate", "f8"),
-        ("hold", "f8"),
-        ("deadband", "f8"),
-        ("smooth_deadband", "f8"),
-        ("mean_to_yaw_rate", "f8"),
-        ("yaw_rate_limit", "f8"),
-        ("yaw_acceleration_limit", "f8"),
-        ("speed_limit", "f8"),
-        ("droop", "f8"),
-        ("shared_supply", "f8"),
-        ("left_factor", "f8"),
-        ("right_factor", "f8"),
-        ("sag_per_s", "f8"),
-        ("stiction", "f8"),
-    ],
-    align=True,
-)
-
 _WHEEL = np.dtype(
-    [
-        ("setpoint", "f8"),
-        ("profile", "f8"),
-        ("profile_rate", "f8"),
-        ("error", "f8"),
-        ("integral", "f8"),
-        ("torque", "f8"),
-        ("angle", "f8"),
-        ("speed", "f8"),
-        ("stuck", "i8"),
-    ],
+    [(name, "f8") for name in ("setpoint", "profile", "profile_rate", "error", "integral", "torque", "angle", "speed")]
+    + [("stuck", "i8")],
     align=True,
 )
 
@@ -87,12 +46,18 @@ class WheelPieces:
     angles: Floats
 
 
+def parameter_record(values: Mapping[str, float]) -> npt.NDArray[np.void]:
+    """Return the values by name as a record for compiled functions, shape (1,)."""
+    return np.array([tuple(values.values())], np.dtype([(name, "f8") for name in values], align=True))
+
+
 class WheelMotors:
     """Motors of both wheels with their command handling."""
 
     def __init__(self, parameters: PlantParameters, effects: HiddenEffects, capacity: int) -> None:
         self.pieces = WheelPieces(np.zeros(capacity, dtype=np.int64), np.zeros((capacity, 2)))
         self._parameters = _parameter_record(parameters, effects)
+        self._step_us = parameters.integration_step_us
         self._state = np.zeros(2, dtype=_WHEEL)
         self._state["stuck"] = 1
 
@@ -137,48 +102,46 @@ class WheelMotors:
             brake,
             disturbance,
             first_cell,
+            self._step_us,
         )
 
 
 def _parameter_record(p: PlantParameters, effects: HiddenEffects) -> npt.NDArray[np.void]:
-    record = np.zeros(1, dtype=_PARAMETERS)
     (lag_s,) = effects.values("motor_lag")
     frequency, damping = effects.values("x_second_order_motor")
     slew_limit, more_to_stop = effects.values("acceleration_limit")
     sag, sag_duration_s = effects.values("battery_sag")
     left_gain, right_gain = effects.values("wheel_gain")
-    values = {
-        "step_us": p.integration_step_us,
-        "tau": lag_s if "motor_lag" in effects else p.speed_loop_time_constant_s,
-        "second_order_frequency": frequency,
-        "second_order_damping": damping,
-        "acceleration_limit": min(p.max_motor_acceleration_rad_s2, slew_limit),
-        "stop_limit": min(p.max_motor_acceleration_rad_s2, slew_limit * (1.0 + more_to_stop)),
-        "inertia": p.wheel_inertia_kg_m2,
-        "viscous": p.viscous_friction_nm_s,
-        "dry": p.dry_friction_nm,
-        "turning_load": p.turning_load_nm,
-        "torque_limit": p.max_motor_torque_nm,
-        "gain": p.tracking_gain_nm_s,
-        "integral_gain": p.tracking_integral_gain_nm,
-        "brake_rate": 1.0 / p.brake_time_constant_s,
-        "hold": p.standstill_hold_rad_s,
-        "deadband": effects.values("deadband")[0],
-        "smooth_deadband": effects.values("x_smooth_deadband")[0],
-        "mean_to_yaw_rate": p.wheel_radius_m / p.axial_distance_m,
-        "yaw_rate_limit": effects.values("yaw_rate_limit")[0],
-        "yaw_acceleration_limit": effects.values("yaw_acceleration_limit")[0],
-        "speed_limit": effects.values("speed_limit")[0],
-        "droop": effects.values("x_motor_droop")[0],
-        "shared_supply": effects.values("x_shared_supply")[0],
-        "left_factor": 1.0 + left_gain,
-        "right_factor": 1.0 + right_gain,
-        "sag_per_s": sag / sag_duration_s,
-        "stiction": effects.values("stiction")[0],
-    }
-    for name, value in values.items():
-        record[name] = value
-    return record
+    return parameter_record(
+        {
+            "tau": lag_s if "motor_lag" in effects else p.speed_loop_time_constant_s,
+            "second_order_frequency": frequency,
+            "second_order_damping": damping,
+            "acceleration_limit": min(p.max_motor_acceleration_rad_s2, slew_limit),
+            "stop_limit": min(p.max_motor_acceleration_rad_s2, slew_limit * (1.0 + more_to_stop)),
+            "inertia": p.wheel_inertia_kg_m2,
+            "viscous": p.viscous_friction_nm_s,
+            "dry": p.dry_friction_nm,
+            "turning_load": p.turning_load_nm,
+            "torque_limit": p.max_motor_torque_nm,
+            "gain": p.tracking_gain_nm_s,
+            "integral_gain": p.tracking_integral_gain_nm,
+            "brake_rate": 1.0 / p.brake_time_constant_s,
+            "hold": p.standstill_hold_rad_s,
+            "deadband": effects.values("deadband")[0],
+            "smooth_deadband": effects.values("x_smooth_deadband")[0],
+            "mean_to_yaw_rate": p.wheel_radius_m / p.axial_distance_m,
+            "yaw_rate_limit": effects.values("yaw_rate_limit")[0],
+            "yaw_acceleration_limit": effects.values("yaw_acceleration_limit")[0],
+            "speed_limit": effects.values("speed_limit")[0],
+            "droop": effects.values("x_motor_droop")[0],
+            "shared_supply": effects.values("x_shared_supply")[0],
+            "left_factor": 1.0 + left_gain,
+            "right_factor": 1.0 + right_gain,
+            "sag_per_s": sag / sag_duration_s,
+            "stiction": effects.values("stiction")[0],
+        }
+    )
 
 
 @compiled
@@ -311,9 +274,9 @@ def _advance(
     brake: bool,
     disturbance: Floats,
     first_cell: int,
+    step_us: int,
 ) -> int:
     p = parameters[0]
-    step_us = p["step_us"]
     pieces = 0
     while now_us < until_us:
         cell = now_us // step_us

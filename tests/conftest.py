@@ -25,14 +25,17 @@ REAL_TIME = ("tests/hil/", "tests/firmware_protocol/emulated/")
 STANDING = tuple(f"tests/hil/test_{name}.py" for name in ("check", "held_up", "path", "waiting"))
 TESTS = Path(__file__).parent
 # With `--dist each` a worker reads and runs only its own folders, as reading all tests takes as long as a tenth of them
-# does to run. The first has the stacks in real time, and what it does after them; all take about equally long.
+# does to run. The first has the stacks in real time; all take about equally long.
 PARTS = (
-    ("adaptation", "hil", "firmware_protocol/emulated", "inference"),
-    ("effects", "gap"),
-    ("daemon", "log"),
-    ("drivers", "estimation", "sim"),
-    ("control", "runtime"),
-    ("drive", "experiments", "first_use", "model", "tasks", "viewer"),
+    ("hil", "firmware_protocol/emulated"),
+    ("gap",),
+    ("log",),
+    ("drivers", "estimation", "effects"),
+    ("runtime", "tasks", "adaptation"),
+    ("control", "tools"),
+    ("drive", "inference", "viewer"),
+    ("daemon", "model", "sim"),
+    ("cli", "experiments", "first_use"),
 )
 # These run while the kernels that the others share are being compiled.
 WITHOUT_KERNELS = (
@@ -160,6 +163,8 @@ def pytest_collection_finish():
     # What has been imported stays: no collection of garbage has to look through it again.
     gc.collect()
     gc.freeze()
+    # What tests leave is little: looking for it a tenth as often costs no memory that counts.
+    gc.set_threshold(10_000, 10, 10)
 
 
 def pytest_deselected(items):

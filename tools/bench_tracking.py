@@ -4,7 +4,7 @@ Wheel radius, axle and x_icr of every robot are off by up to 15 %, and nobody is
 known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a second. The gains of the classical ones
 were found on robots 0 to 4 (`docs/results.md`); these are robots 1000 on, or others with `--first`.
 Names that begin with `mujoco_` drive the robot of `tools/mujoco_plant.py`, those with `turned_` the same robots with
-their back as their front (`tools/turned_plant.py`), as the MPC drives them. Ways that begin with `timed_` are
+their back as their front (`turned_robot`), as the MPC drives them. Ways that begin with `timed_` are
 way-points by time, of which the distance from the line is shown.
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
@@ -28,14 +28,11 @@ import numpy as np
 
 from disco_hw.control import Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.control.baselines import Kanayama, LinearQuadratic, PurePursuit
-from disco_hw.control.plan import LawController
 from disco_hw.runtime.pipeline import Planner
-from disco_hw.tasks.circle import CircleCost
-from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
-from tools.mujoco_plant import MujocoPlant, mujoco_robots
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots, turned_robot
+from tools.mujoco_plant import mujoco_plant, mujoco_robots
 from tools.nmpc import NonlinearMpc
-from tools.tracking import LIMITS, Contender, Drive, Plant, Track, classical, disco, drive, model, timed, tracks
-from tools.turned_plant import TurnedPlant, turned_robot
+from tools.tracking import LIMITS, Contender, Drive, Track, classical, disco, drive, model, timed, tracks
 
 FIRST = 1000
 SPEED_M_S, RATE_HZ = 0.2, 50.0
@@ -56,7 +53,6 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
         "pure_pursuit_integral": integral,
         "kanayama": classical(Kanayama(), speed_m_s),
         "lqr": classical(LinearQuadratic(), speed_m_s),
-        "pytorch_mppi": Contender(_peer),
         "nmpc": nmpc,
         "nmpc_forward": nmpc_forward,
         "disco_point": disco(replace(settings, uncertainty="point")),
@@ -75,41 +71,19 @@ def _nmpc(speed_m_s: float, forward: bool, robot: ForeignRobot, track: Track) ->
     return NonlinearMpc(robot, track, speed_m_s, robot.believed, forward)
 
 
-def _peer(robot: ForeignRobot, track: Track) -> Planner:
-    """pytorch_mppi with the paper's gains and cost, ten times a second; its commands are held in between."""
-    from tools.control_peers import circle_command, circle_mppi, distance_map, line_mppi  # noqa: PLC0415  (of [bench])
-
-    believed, settings = model(robot), DiscoSettings.paper()
-    if isinstance(track.task, CircleCost):
-        mppi = circle_mppi(believed, track.task, settings, LIMITS.speed_rad_s)
-    else:
-        mppi = line_mppi(believed, distance_map(track.points_m), SPEED_M_S, settings, LIMITS.speed_rad_s)
-    command = circle_command(mppi, 1)
-    current_command, due_ns = (0.0, 0.0), 0
-
-    def law(state: PlannerState, _task: object, _model: object) -> tuple[float, float]:
-        nonlocal current_command, due_ns
-        if state.t_ns >= due_ns:
-            current_command, due_ns = command(state.t_ns, state), state.t_ns + round(settings.step_s * 1e9)
-        return current_command
-
-    return LawController(law, believed, track.task)
-
-
 def rows(
     count: int, names: tuple[str, ...], ways: tuple[str, ...], first: int = FIRST, speed_m_s: float = SPEED_M_S
 ) -> Iterator[tuple[str, list[Drive]]]:
     """The drives of these contenders on robots `first` to `first + count` - 1, and what they are called, by way."""
     for name in names:
         made: Callable[[int, int], list[ForeignRobot]] = robots
-        plant_of: Callable[..., Plant] = ForeignPlant
+        plant_of: Callable[..., ForeignPlant] = ForeignPlant
         contender = name
         if contender.startswith(MUJOCO):
-            made, plant_of, contender = mujoco_robots, MujocoPlant, contender.removeprefix(MUJOCO)
+            made, plant_of, contender = mujoco_robots, mujoco_plant, contender.removeprefix(MUJOCO)
         driven = made(first, count)
         if contender.startswith(TURNED):
             driven, contender = [turned_robot(robot) for robot in driven], contender.removeprefix(TURNED)
-            plant_of = partial(TurnedPlant, plant_of)
         for way in ways:
             track = tracks(speed_m_s)[way.removeprefix(TIMED)]
             track = timed(track, speed_m_s) if way.startswith(TIMED) else track

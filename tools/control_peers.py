@@ -7,37 +7,25 @@ way to carry them; everything is batched over samples and points, and its noise 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from pytorch_mppi import MPPI
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from disco_hw.control import pendulum
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.pendulum import PendulumPoints
 from disco_hw.control.plan import DiscoSettings, PlannerState
-from disco_hw.experiments.circle import Command
 from disco_hw.model import Model
 from disco_hw.tasks.circle import CircleCost
 
-Distance = Callable[[Tensor, Tensor], Tensor]
-"""How far positions x, y (m) are from a line (m)."""
-
 
 def circle_mppi(model: Model, circle: CircleCost, settings: DiscoSettings, largest_rad_s: float) -> Any:
-    """MPPI for the paper's circle, round the origin; see `line_mppi`."""
-    return line_mppi(model, lambda x, y: torch.hypot(x, y) - circle.radius_m, circle.speed_m_s, settings, largest_rad_s)
+    """MPPI for the paper's circle, round the origin, under sigma points; its state is x, y, yaw and speed of L points.
 
-
-def line_mppi(model: Model, distance: Distance, speed_m_s: float, settings: DiscoSettings, largest_rad_s: float) -> Any:
-    """MPPI for a line at a speed under sigma points; its state is x, y, yaw and speed of L points, (4 L,).
-
-    The cost of a state is the paper's: distance from the line and error of the speed, as one length.
+    Its shape is (4 L,); its cost is the paper's: distance from the line and error of the speed, as one length.
     """
     theta, weights = unscented_points(model, settings.ut_alpha)
     radius, axial, x_icr = (torch.tensor(column, dtype=torch.float32) for column in theta[:, :3].T)
@@ -57,8 +45,8 @@ def line_mppi(model: Model, distance: Distance, speed_m_s: float, settings: Disc
         )
 
     def cost(state: Tensor, _control: Tensor) -> Tensor:
-        off = distance(state[:, :points], state[:, points : 2 * points])
-        return torch.hypot(off, state[:, 3 * points :] - speed_m_s) @ share
+        off = torch.hypot(state[:, :points], state[:, points : 2 * points]) - circle.radius_m
+        return torch.hypot(off, state[:, 3 * points :] - circle.speed_m_s) @ share
 
     sampler = settings.sampler
     return MPPI(
@@ -68,51 +56,10 @@ def line_mppi(model: Model, distance: Distance, speed_m_s: float, settings: Disc
     )  # fmt: skip
 
 
-_CELL_M, _AROUND_M = 0.005, 1.5
-
-
-def distance_map(points_m: NDArray[np.float64]) -> Distance:
-    """The distance from the line through points (N, 2), read off a grid between whose nodes it is linear.
-
-    Beyond 1.5 m around the line it is that at the grid's edge, and what is missing to it.
-    """
-    low, high = points_m.min(axis=0) - _AROUND_M, points_m.max(axis=0) + _AROUND_M
-    steps = np.hypot(*np.diff(points_m, axis=0).T)
-    along = np.concatenate([[0.0], np.cumsum(steps)])
-    places = np.arange(0.0, along[-1], 0.2 * _CELL_M)
-    dense = np.column_stack([np.interp(places, along, column) for column in points_m.T])
-    x, y = (np.arange(low[axis], high[axis] + _CELL_M, _CELL_M) for axis in (0, 1))
-    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    table = torch.tensor(cKDTree(dense).query(nodes)[0], dtype=torch.float32).reshape(-1)
-    columns, last = y.size, (x.size - 1.001, y.size - 1.001)
-
-    def distance(x_m: Tensor, y_m: Tensor) -> Tensor:
-        at_x, at_y = (x_m - low[0]) / _CELL_M, (y_m - low[1]) / _CELL_M
-        on_x, on_y = at_x.clamp(0.0, last[0]), at_y.clamp(0.0, last[1])
-        node = on_x.long() * columns + on_y.long()
-        part_x, part_y = on_x - on_x.floor(), on_y - on_y.floor()
-        below = table[node] + part_x * (table[node + columns] - table[node])
-        above = table[node + 1] + part_x * (table[node + columns + 1] - table[node + 1])
-        return below + part_y * (above - below) + _CELL_M * torch.hypot(at_x - on_x, at_y - on_y)
-
-    return distance
-
-
 def circle_state(points: int, state: PlannerState) -> Tensor:
-    """The state that `line_mppi` starts from."""
+    """The state that `circle_mppi` starts from."""
     here = np.array([state.x_m, state.y_m, state.yaw_rad, 0.0], dtype=np.float32)
     return torch.tensor(np.repeat(here, points))
-
-
-def circle_command(mppi: Any, seed: int) -> Command:
-    """MPPI as a function from time and state to wheel speeds; it must be called once a step."""
-    torch.manual_seed(seed)
-
-    def command(_now_ns: int, state: PlannerState) -> tuple[float, float]:
-        left, right = mppi.command(circle_state(mppi.nx // 4, state)).tolist()
-        return left, right
-
-    return command
 
 
 def pendulum_mppi(points: PendulumPoints, samples: int, horizon: int) -> Any:

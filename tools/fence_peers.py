@@ -40,8 +40,8 @@ from disco_hw.runtime.pipeline import (
 from disco_hw.runtime.robot_setup import Setup
 from drivers.types import Readings
 from sim.plant_parameters import PlantParameters
-from tools.foreign_plant import ForeignRobot
-from tools.mujoco_plant import MujocoPlant, mujoco_robots
+from tools.foreign_plant import ForeignPlant, ForeignRobot
+from tools.mujoco_plant import mujoco_plant, mujoco_robots
 from tools.nmpc import NonlinearMpc
 from tools.tracking import LIMITS, circle_track, model
 
@@ -70,7 +70,7 @@ def mujoco_hand_drive(rng: np.random.Generator, seconds: float) -> FencedDrive:
     """Wild wheel speeds in a random room, each held for half a second or so, from the middle of the room."""
     robot = mujoco_robots(int(rng.integers(1 << 20)), 1)[0]
     fence = random_room(rng, 0)
-    plant = MujocoPlant(robot, (-0.2, 0.0, 0.0), int(rng.integers(1 << 30)))
+    plant = mujoco_plant(robot, (-0.2, 0.0, 0.0), int(rng.integers(1 << 30)))
     motion, next_s = Manual(0.0, 0.0), 0.0
 
     def hand(t_s: float) -> Motion:
@@ -94,12 +94,12 @@ def mujoco_task_drive(rng: np.random.Generator, seconds: float) -> FencedDrive:
     )  # fmt: skip
     around.set_line(task.course().outline_m())
     planner = Disco(model(robot), task.planned("default"), settings, LIMITS, 1, around)
-    plant = MujocoPlant(robot, task.course().start, int(rng.integers(1 << 30)))
+    plant = mujoco_plant(robot, task.course().start, int(rng.integers(1 << 30)))
     return _mujoco_drive(robot, plant, fence, planner, lambda t_s: FollowTask(), seconds)
 
 
 def _mujoco_drive(
-    robot: ForeignRobot, plant: MujocoPlant, fence: Fence, planner: Planner, motion_at: Callable[[float], Motion],
+    robot: ForeignRobot, plant: ForeignPlant, fence: Fence, planner: Planner, motion_at: Callable[[float], Motion],
     seconds: float,
 ) -> FencedDrive:  # fmt: skip
     """Let the robot stand for a second, then move it as `motion_at` says for each time (s), under the guard."""

@@ -3,14 +3,15 @@
 Two rows of tyres push a body that has mass and inertia, with a force that grows with their slip and then saturates, and
 build it up over a relaxation length; motors lag and have a dead band; grip varies slowly and by itself on either side.
 Wheels are known through ticks, the pose with noise and late. In steady motion the robot has a wheel radius, an axle and
-a centre of rotation; between steady motions it has none.
+a centre of rotation; between steady motions it has none. Another body can take the place of this one behind the same
+sensors (`tools/mujoco_plant.py`).
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -30,7 +31,7 @@ NOMINAL = (0.061, 0.415, 0.238)
 class ForeignRobot:
     """Parameters of the plant in SI units: `grip_std` is slip as a part of the speed, correlated over `grip_s`.
 
-    `believed`: the wheel radius, axle and x_icr that controllers are given of it.
+    `believed`: the wheel radius, axle and x_icr that controllers are given. `turned`: its back is called its front.
     """
 
     radius_m: float
@@ -53,6 +54,18 @@ class ForeignRobot:
     slope_m_s: float = 0.0
     left_gain: float = 1.0
     believed: tuple[float, float, float] = NOMINAL
+    turned: bool = False
+
+
+def turned_robot(robot: ForeignRobot) -> ForeignRobot:
+    """The same machine under a controller that drives it the other way round.
+
+    Left is right, ahead is behind, and the centre of rotation lies on the other side of the tracked point. Which end of
+    a skid-steer robot is called its front is up to its owner, and following a line is easier for a tracked point that
+    lies ahead of the centre of rotation.
+    """
+    radius_m, axle_m, x_icr_m = robot.believed
+    return replace(robot, x_icr_m=-robot.x_icr_m, believed=(radius_m, axle_m, -x_icr_m), turned=not robot.turned)
 
 
 def robots(first: int, count: int, spread: float = 0.15, **changes: Any) -> list[ForeignRobot]:
@@ -94,20 +107,34 @@ def _advance(state: Any, left: float, right: float, numbers: Any, noise: Any) ->
         state[_YAW] += STEP_S * state[_OMEGA]
 
 
+class Body(Protocol):
+    """A body in the place of this plant's own, at rest where the plant begins."""
+
+    def advance(self, state: np.ndarray, left_rad_s: float, right_rad_s: float, until_ms: int) -> None:
+        """Hold these wheel commands until a time; write pose, forward speed and the wheels' angles into the state."""
+
+
 class ForeignPlant:
     """A robot at rest at a pose (x, y, yaw); all noise comes from the seed."""
 
-    def __init__(self, robot: ForeignRobot, start: tuple[float, float, float], seed: int) -> None:
-        self.robot = robot
+    def __init__(
+        self, robot: ForeignRobot, start: tuple[float, float, float], seed: int, body: Body | None = None
+    ) -> None:
         self.state = np.zeros(14)
-        self.state[:3] = start
+        self.state[:3] = start[0], start[1], start[2] + (math.pi if robot.turned else 0.0)
         self.now_ms = 0
+        self._body = body
         self._rng = np.random.default_rng([seed, 5])
         self._delayed: list[tuple[int, PoseSample]] = []
         self._past = [(0, 0)] * 3
-        r = robot
+        self.become(robot)
+
+    def become(self, robot: ForeignRobot) -> None:
+        """Go on as another robot from now on."""
+        self.robot = r = robot
+        x_icr_m = -r.x_icr_m if r.turned else r.x_icr_m
         self._numbers = (
-            r.radius_m, r.axle_m, r.x_icr_m, r.lag_s, r.dead_rad_s, r.mass_kg, r.inertia_kg_m2, r.push_n, r.push_at_m_s,
+            r.radius_m, r.axle_m, x_icr_m, r.lag_s, r.dead_rad_s, r.mass_kg, r.inertia_kg_m2, r.push_n, r.push_at_m_s,
             r.relaxation_m, r.side_s, r.grip_std, r.grip_s, r.slope_m_s, r.left_gain,
         )  # fmt: skip
 
@@ -115,12 +142,12 @@ class ForeignPlant:
     def pose(self) -> tuple[float, float, float]:
         """True pose of the robot: x, y (m), yaw (rad)."""
         x, y, yaw = self.state[:3].tolist()
-        return x, y, yaw
+        return x, y, yaw + math.pi if self.robot.turned else yaw
 
     @property
     def forward_m_s(self) -> float:
         """True speed along the body."""
-        return float(self.state[_V])
+        return float(-self.state[_V] if self.robot.turned else self.state[_V])
 
     @property
     def wheels_rad_s(self) -> tuple[float, float]:
@@ -145,9 +172,12 @@ class ForeignPlant:
             span = tick / (len(self._past) * _SAMPLES_EVERY * STEP_S)
             speeds = (left - self._past[0][0]) * span, (right - self._past[0][1]) * span
             self._past = [*self._past[1:], (left, right)]
-            wheels.append(WheelSample(self.now_ns, self.now_ns, left * tick, right * tick, *speeds))
+            values = (left * tick, right * tick, *speeds)
+            if self.robot.turned:
+                values = (-right * tick, -left * tick, -speeds[1], -speeds[0])
+            wheels.append(WheelSample(self.now_ns, self.now_ns, *values))
         if self.now_ms % _POSES_EVERY == 0:
-            x, y, yaw = self.state[:3] + self._rng.standard_normal(3) * self._pose_std()
+            x, y, yaw = self.pose + self._rng.standard_normal(3) * self._pose_std()
             due = self.now_ms + round(self.robot.pose_delay_s / STEP_S)
             stamp = self.now_ns
             sample = PoseSample(
@@ -161,8 +191,13 @@ class ForeignPlant:
 
     def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
         """Hold these wheel commands for `count` milliseconds."""
-        _advance(self.state, left_rad_s, right_rad_s, self._numbers, self._rng.standard_normal((count, 2)))
+        if self.robot.turned:
+            left_rad_s, right_rad_s = -right_rad_s, -left_rad_s
         self.now_ms += count
+        if self._body is None:
+            _advance(self.state, left_rad_s, right_rad_s, self._numbers, self._rng.standard_normal((count, 2)))
+        else:
+            self._body.advance(self.state, left_rad_s, right_rad_s, self.now_ms)
 
     def _pose_std(self) -> np.ndarray:
         return np.array([self.robot.pose_std_m, self.robot.pose_std_m, self.robot.yaw_std_rad])

@@ -1,4 +1,4 @@
-"""Hand-driven commands for a robot that is tried out: with the stick of a joystick, or with the keys of a keyboard."""
+"""Drives by hand of a robot that is tried out, with a joystick's stick or a keyboard's keys, and the log of one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, differentiate_angle
 
 Array = NDArray[np.float64]
 
@@ -83,3 +85,20 @@ def _slow(rng: np.random.Generator, shape: tuple[int, ...], samples: float) -> A
     for k in range(1, shape[0]):
         white[k] = keep * white[k - 1] + math.sqrt(1.0 - keep * keep) * white[k]
     return white
+
+
+def recorded_drive(
+    source: str, command_s: Array, command: Array, wheel_s: Array, angle: Array, pose_s: Array, pose: Array
+) -> DriveLog:
+    """The log that a host would have: commands (N, 2) rad/s, wheel angles (M, 2) rad, poses (P, 3) m and rad, by times.
+
+    Wheel speeds are derived from the angles, and nothing interrupts the drive.
+    """
+    unbroken = [np.zeros(times.size, dtype=np.int64) for times in (command_s, wheel_s, pose_s)]
+    speed = [differentiate_angle(wheel_s, angle[:, side], unbroken[1]) for side in (0, 1)]
+    return DriveLog(
+        (source,),
+        Commands(command_s, command[:, 0], command[:, 1], unbroken[0]),
+        Wheels(wheel_s, angle[:, 0], angle[:, 1], speed[0], speed[1], unbroken[1], True, False),
+        Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], unbroken[2]),
+    )

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from drivers.types import Readings
 from tools.foreign_plant import ForeignPlant, ForeignRobot
 from tools.mujoco_robot import STEPS_PER_S, WHEEL_RADIUS_M, mjcf
 
@@ -19,7 +18,8 @@ BEHIND_M = 0.2
 # What turning at the speed and radius of the circle shows, and how the wheels rise to a command.
 AXLE_M, LAG_S = 1.1, 0.08
 _SETTLES_S = 1
-_ANGLES = slice(10, 12)
+_FORWARD, _ANGLES = 3, slice(10, 12)
+"""Columns of the plant's state."""
 
 
 def mujoco_robots(first: int, count: int, spread: float = 0.15) -> list[ForeignRobot]:
@@ -34,16 +34,21 @@ def mujoco_robots(first: int, count: int, spread: float = 0.15) -> list[ForeignR
     return found
 
 
-class MujocoPlant:
+def mujoco_plant(robot: ForeignRobot, start: tuple[float, float, float], seed: int) -> ForeignPlant:
     """A robot at rest with its tracked point at a pose (x, y, yaw); all noise comes from the seed."""
+    heading_rad = start[2] + (math.pi if robot.turned else 0.0)
+    return ForeignPlant(robot, start, seed, _MujocoBody((start[0], start[1], heading_rad)))
 
-    def __init__(self, robot: ForeignRobot, start: tuple[float, float, float], seed: int) -> None:
+
+class _MujocoBody:
+    """The robot in MuJoCo, settled on its floor."""
+
+    def __init__(self, start: tuple[float, float, float]) -> None:
         import mujoco  # noqa: PLC0415  (of those who drive it only)
 
         self._step = mujoco.mj_step
         self._model: Any = mujoco.MjModel.from_xml_string(mjcf({}))
         self._data: Any = mujoco.MjData(self._model)
-        self._sensors = ForeignPlant(robot, start, seed)
         x_m, y_m, yaw_rad = start
         place = x_m + BEHIND_M * math.cos(yaw_rad), y_m + BEHIND_M * math.sin(yaw_rad)
         self._data.qpos[:2] = place
@@ -54,46 +59,20 @@ class MujocoPlant:
         self._turned = self._data.qpos[self._motors].copy()
         self._steps = 0
 
-    @property
-    def now_ms(self) -> int:
-        """Time of the plant, ms."""
-        return self._sensors.now_ms
-
-    @property
-    def now_ns(self) -> int:
-        """Time of the plant, ns."""
-        return self._sensors.now_ns
-
-    @property
-    def pose(self) -> tuple[float, float, float]:
-        """True pose of the tracked point."""
-        return self._sensors.pose
-
-    @property
-    def forward_m_s(self) -> float:
-        """True speed along the body."""
-        yaw_rad = self.pose[2]
-        return float(self._data.qvel[0] * math.cos(yaw_rad) + self._data.qvel[1] * math.sin(yaw_rad))
-
-    def readings(self) -> Readings:
-        """Return the sensors' samples at this time."""
-        return self._sensors.readings()
-
-    def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
-        """Hold these wheel commands for `count` milliseconds."""
-        sensors, data = self._sensors, self._data
-        sensors.now_ms += count
+    def advance(self, state: np.ndarray, left_rad_s: float, right_rad_s: float, until_ms: int) -> None:
+        """Hold these wheel commands until a time; write pose, forward speed and the wheels' angles into the state."""
+        data = self._data
         data.ctrl[:] = left_rad_s, right_rad_s, left_rad_s, right_rad_s
-        while self._steps < round(sensors.now_ms * STEPS_PER_S / 1000):
+        while self._steps < round(until_ms * STEPS_PER_S / 1000):
             self._step(self._model, data)
             self._steps += 1
         w, x, y, z = data.qpos[3:7].tolist()
-        before = float(sensors.state[2])
+        before = float(state[2])
         yaw_rad = before + math.remainder(
             math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) - before, math.tau
         )
-        sensors.state[0] = data.qpos[0] - BEHIND_M * math.cos(yaw_rad)
-        sensors.state[1] = data.qpos[1] - BEHIND_M * math.sin(yaw_rad)
-        sensors.state[2] = yaw_rad
+        cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
+        state[:3] = data.qpos[0] - BEHIND_M * cosine, data.qpos[1] - BEHIND_M * sine, yaw_rad
+        state[_FORWARD] = data.qvel[0] * cosine + data.qvel[1] * sine
         turned = data.qpos[self._motors] - self._turned
-        sensors.state[_ANGLES] = 0.5 * (turned[:2] + turned[2:])
+        state[_ANGLES] = 0.5 * (turned[:2] + turned[2:])

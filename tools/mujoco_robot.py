@@ -1,4 +1,4 @@
-"""A skid-steer robot in MuJoCo, as a truth that is not ours: `python -m tools.mujoco_robot --hide EFFECT=SIZE -o LOG`.
+"""A skid-steer robot in MuJoCo, as a truth that is not ours.
 
 Four wheels in contact with a floor, each on a velocity servo with a lag and a limited torque, driven by a script like a
 person with a joystick. It shares no constant and no equation with the virtual robot or with the model that the search
@@ -12,20 +12,16 @@ robots of three sizes.
 
 from __future__ import annotations
 
-import argparse
 import math
-import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.log.drive import Commands, DriveLog, Gyro, Poses, Wheels, differentiate_angle
-from disco_hw.log.importing import write_log
-from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, TOP_RAD_S, joystick, keyboard
+from disco_hw.log.drive import DriveLog
+from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, TOP_RAD_S, joystick, keyboard, recorded_drive
 
 Array = NDArray[np.float64]
 
@@ -112,6 +108,21 @@ class Robot:
         return self.sizes.get(effect, EFFECTS[effect][0])
 
 
+_SIZES = {
+    "command_delay": (0.097, 0.205),
+    "motor_lag": (0.155, 0.31),
+    "dead_band": (0.36, 0.81),
+    "dry_friction": (0.36, 0.81),
+    "unequal_wheels": (0.021, 0.031),
+    "pose_latency": (0.125, 0.155),
+    "slope": (4.1, 7.2),
+    "payload": (18.5, 2.1),
+    "torque_limit": (14.3, 0.81),
+    "worn_tyre": (0.51, 0.41),
+    "backlash": (0.053, 0.155),
+}
+"""Usual sizes of what can be hidden in the heavy robot and in the light one."""
+
 ROBOTS = {
     "middle": Robot(),
     "heavy": Robot(
@@ -127,19 +138,7 @@ ROBOTS = {
         torque_nm=61.0,
         friction=0.79,
         base_kg=47.0,
-        sizes={
-            "command_delay": 0.097,
-            "motor_lag": 0.155,
-            "dead_band": 0.36,
-            "dry_friction": 0.36,
-            "unequal_wheels": 0.021,
-            "pose_latency": 0.125,
-            "slope": 4.1,
-            "payload": 18.5,
-            "torque_limit": 14.3,
-            "worn_tyre": 0.51,
-            "backlash": 0.053,
-        },
+        sizes={name: of[0] for name, of in _SIZES.items()},
     ),
     "light": Robot(
         wheel_radius_m=0.0615,
@@ -161,19 +160,7 @@ ROBOTS = {
         rotor_kg_m2=0.0061,
         bearing_nm_s=0.0021,
         payload_m={"half": 0.031, "aside": 0.081, "high": 0.0815},
-        sizes={
-            "command_delay": 0.205,
-            "motor_lag": 0.31,
-            "dead_band": 0.81,
-            "dry_friction": 0.81,
-            "unequal_wheels": 0.031,
-            "pose_latency": 0.155,
-            "slope": 7.2,
-            "payload": 2.1,
-            "torque_limit": 0.81,
-            "worn_tyre": 0.41,
-            "backlash": 0.155,
-        },
+        sizes={name: of[1] for name, of in _SIZES.items()},
     ),
 }
 """Robots of three sizes; where none is named, the first."""
@@ -234,17 +221,7 @@ class Recording:
 
     def as_drive(self) -> DriveLog:
         """The log that a host would have: nothing of the truth."""
-        angle, segments = self.angle, np.zeros(self.wheel_s.size, dtype=np.int64)
-        speed = [differentiate_angle(self.wheel_s, angle[:, side], segments) for side in (0, 1)]
-        none = np.empty(0, dtype=np.int64)
-        zeros = [np.zeros(times.size, dtype=np.int64) for times in (self.command_s, self.pose_s)]
-        return DriveLog(
-            ("mujoco",),
-            Commands(self.command_s, self.command[:, 0], self.command[:, 1], zeros[0]),
-            Wheels(self.wheel_s, angle[:, 0], angle[:, 1], speed[0], speed[1], segments, True, False),
-            Poses(self.pose_s, self.pose[:, 0], self.pose[:, 1], self.pose[:, 2], zeros[1]),
-            Gyro(np.empty(0), np.empty(0), none),
-        )
+        return recorded_drive("mujoco", self.command_s, self.command, self.wheel_s, self.angle, self.pose_s, self.pose)
 
 
 def mjcf(hidden: Hidden, robot: Robot = ROBOTS["middle"]) -> str:
@@ -363,32 +340,3 @@ def record(hidden: Hidden, seed: int, command: Array | None = None, robot: Robot
         hidden=dict(hidden),
         robot=robot,
     )
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m tools.mujoco_robot", description=(__doc__ or "").split(":")[0])
-    about = "; ".join(f"{name}={usual} {description}" for name, (usual, description) in EFFECTS.items())
-    parser.add_argument("--hide", action="append", default=[], metavar="EFFECT[=SIZE]", help=about)
-    parser.add_argument("--robot", choices=tuple(ROBOTS), default="middle", help="which robot (middle)")
-    parser.add_argument("--seed", type=int, default=1, help="of drive and noise (1)")
-    parser.add_argument("--seconds", type=float, default=DURATION_S, help=f"length of the drive ({DURATION_S:g})")
-    parser.add_argument("-o", "--out", type=Path, required=True, help="log to write")
-    options = parser.parse_args(arguments)
-    hidden, robot = {}, ROBOTS[options.robot]
-    for text in options.hide:
-        name, _, size = text.partition("=")
-        if name not in EFFECTS:
-            parser.error(f"--hide {text}: no such effect; give some of {', '.join(EFFECTS)}")
-        try:
-            hidden[name] = float(size) if size else robot.size(name)
-        except ValueError:
-            parser.error(f"--hide {text}: {size} is no number")
-    command = joystick(options.seed, options.seconds, robot.top_rad_s)
-    recording = record(hidden, options.seed, command, robot)
-    records = write_log(recording.as_drive(), options.out, "mujoco")
-    print(f"{options.out}: {records} records")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.baselines import NominalRobot
+from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import Diagnostics, NoValidControl, PlannerState, Rollouts, WheelPlan, no_rollouts
 from disco_hw.model import Belief
 from tools.foreign_plant import ForeignRobot
@@ -81,9 +81,9 @@ class NonlinearMpc:
         self.reset()
 
     @property
-    def chassis(self) -> NominalRobot:
+    def chassis(self) -> SteeredChassis:
         """The robot in the mean of what is believed."""
-        return NominalRobot(*self._geometry.tolist(), self._lag_s, self._dead_rad_s, LIMITS)
+        return SteeredChassis(*self._geometry.tolist(), self._lag_s, self._dead_rad_s)
 
     def reset(self) -> None:
         """Forget the last solution."""

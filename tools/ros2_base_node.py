@@ -96,10 +96,7 @@ class BaseNode:
         self._pose[0] += 0.5 * (moved[0] + moved[1]) * math.cos(middle)
         self._pose[1] += 0.5 * (moved[0] + moved[1]) * math.sin(middle)
         self._pose[2] += turn
-        half = 0.5 * self._pose[2]
-        pose = msg.RosPose(
-            msg.Point(self._pose[0], self._pose[1], 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half))
-        )
+        pose = msg.RosPose(msg.Point(self._pose[0], self._pose[1], 0.0), msg.about_z(self._pose[2]))
         linear, angular = 0.5 * radius * (speeds[0] + speeds[1]), radius * (speeds[1] - speeds[0]) / track
         twist = msg.Twist(msg.Vector3(linear, 0.0, 0.0), msg.Vector3(0.0, 0.0, angular))
         self._wheel_writer.write(

@@ -57,17 +57,15 @@ def main(domain: str, kind: str, east: str, north: str, heading: str) -> None:
             place, turned = received.pose.pose.position, received.pose.pose.orientation
             at_x = x + math.cos(yaw) * place.x - math.sin(yaw) * place.y
             at_y = y + math.sin(yaw) * place.x + math.cos(yaw) * place.y
-            half = 0.5 * (yaw + 2.0 * math.atan2(turned.z, turned.w))
-            pose = msg.RosPose(msg.Point(at_x, at_y, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
+            pose = msg.RosPose(msg.Point(at_x, at_y, 0.0), msg.about_z(yaw + msg.yaw_of(turned)))
             message = msg.PoseStamped(msg.Header(received.header.stamp, "map"), pose)
             times = 1
             if transforms is not None:
                 times = 0
-                turned = msg.Quaternion(0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
                 # A correction that is new each time.
                 shift = msg.Vector3(x + 1e-6 * (received_ns % 1000), y, 0.0)
                 ahead = msg.stamp_of(msg.time_of(received.header.stamp) + 200_000_000)
-                one = msg.TransformStamped(msg.Header(ahead, "map"), "odom", msg.Transform(shift, turned))
+                one = msg.TransformStamped(msg.Header(ahead, "map"), "odom", msg.Transform(shift, msg.about_z(yaw)))
                 transforms.write(msg.TFMessage([one]))
             if wrong:
                 if kind == "nan":

@@ -1,7 +1,7 @@
 """Drives as wheel-speed commands over time: the way a person drives, and protocols; seeded.
 
-Speeds are fractions of the robot's largest wheel speed, so that one drive suits any robot. A drive is built from
-manoeuvres; between them the robot rests, and every change goes through the driver's hand, which is not infinitely fast.
+Speeds are fractions of the robot's largest wheel speed. A drive is built from manoeuvres; between them the robot rests,
+and every change goes through the driver's hand, which is not infinitely fast.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
+LARGEST_RAD_S, RATE_HZ = 8.0, 50.0
+"""Largest wheel speed, and how often commands are given."""
 REST_S = 0.6
 HAND_RAD_S2 = (8.0, 14.0)
 SHARP_RAD_S2 = 20.0
@@ -22,10 +24,6 @@ TREMOR_S = 0.4
 
 Floats = npt.NDArray[np.float64]
 Profile = Callable[[Floats], Floats]
-
-
-class UnknownDriveError(ValueError):
-    """No drive has this name; the message lists all names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,28 +46,11 @@ class ScriptedDrive:
         return len(self.t_s) * self.period_s
 
 
-@dataclass(frozen=True, slots=True)
-class Vehicle:
-    """Limits of a driver's requests: largest wheel speed (rad/s), and how often commands are given (Hz).
-
-    Raises ValueError if either is not a positive number.
-    """
-
-    max_wheel_speed_rad_s: float = 8.0
-    rate_hz: float = 50.0
-
-    def __post_init__(self) -> None:
-        for name, value in (("max_wheel_speed_rad_s", self.max_wheel_speed_rad_s), ("rate_hz", self.rate_hz)):
-            if not 0.0 < value < math.inf:
-                raise ValueError(f"{name} = {value:g} is impossible; write a positive number")
-
-
 class _Tape:
     """Collects wanted speeds (fractions: common, difference / 2) and turns them into commands of a human hand."""
 
-    def __init__(self, generator: np.random.Generator, vehicle: Vehicle) -> None:
+    def __init__(self, generator: np.random.Generator) -> None:
         self.generator = generator
-        self._vehicle = vehicle
         self._desired: list[Floats] = []
         self._slew: list[Floats] = []
         self._phase: list[str] = []
@@ -80,8 +61,8 @@ class _Tape:
 
     def play(self, phase: str, seconds: float, speed: Profile, turn: Profile, sharp: bool = False) -> None:
         """Append a manoeuvre given as functions of the time since its start (s)."""
-        count = max(round(seconds * self._vehicle.rate_hz), 1)
-        t = np.arange(count) / self._vehicle.rate_hz
+        count = max(round(seconds * RATE_HZ), 1)
+        t = np.arange(count) / RATE_HZ
         self._desired.append(np.stack([speed(t), turn(t)], axis=1))
         slew = SHARP_RAD_S2 if sharp else float(self.generator.uniform(*HAND_RAD_S2))
         self._slew.append(np.full(count, slew))
@@ -100,21 +81,21 @@ class _Tape:
         desired = np.concatenate(self._desired)
         if not steady:
             desired = desired * (1.0 + self._tremor(desired.shape))
-        largest = self._vehicle.max_wheel_speed_rad_s
+        largest = LARGEST_RAD_S
         wheels = largest * np.stack([desired[:, 0] - desired[:, 1], desired[:, 0] + desired[:, 1]], axis=1)
         wheels *= np.minimum(1.0, largest / np.maximum(np.abs(wheels).max(axis=1, keepdims=True), 1e-9))
-        steps = np.concatenate(self._slew) / self._vehicle.rate_hz
+        steps = np.concatenate(self._slew) / RATE_HZ
         commands = np.zeros(wheels.shape)
         now = np.zeros(2)
         for k, (target, step) in enumerate(zip(wheels, steps, strict=True)):
             now = now + np.clip(target - now, -step, step)
             commands[k] = now
-        period_s = 1.0 / self._vehicle.rate_hz
+        period_s = 1.0 / RATE_HZ
         t_s = np.arange(len(commands), dtype=np.float64) * period_s
         return ScriptedDrive(name, period_s, t_s, commands[:, 0], commands[:, 1], tuple(self._phase))
 
     def _tremor(self, shape: tuple[int, ...]) -> Floats:
-        decay = math.exp(-1.0 / (TREMOR_S * self._vehicle.rate_hz))
+        decay = math.exp(-1.0 / (TREMOR_S * RATE_HZ))
         noise = self.generator.standard_normal(shape)
         for k in range(1, shape[0]):
             noise[k] = decay * noise[k - 1] + math.sqrt(1.0 - decay**2) * noise[k]
@@ -260,13 +241,11 @@ DRIVES: Mapping[str, Callable[[_Tape], ScriptedDrive]] = MappingProxyType(
 )
 
 
-def create_drive(name: str, seed: int, vehicle: Vehicle | None = None) -> ScriptedDrive:
+def create_drive(name: str, seed: int) -> ScriptedDrive:
     """Make one of `DRIVES`.
 
     `rich`: about 150 s of everything that identification asks for, in random order; `free`: 140 s of a person with a
     stick; `circle`: one steady circle of 60 s; `straight`: lines at two speeds, forward and back; `poor`: 13 s of
-    crawling; `random_steps`: random wheel speeds held for 6 s. Raises UnknownDriveError.
+    crawling; `random_steps`: random wheel speeds held for 6 s.
     """
-    if name not in DRIVES:
-        raise UnknownDriveError(f"{name!r} is no drive; the names are {', '.join(DRIVES)}")
-    return DRIVES[name](_Tape(np.random.default_rng(seed), vehicle or Vehicle()))
+    return DRIVES[name](_Tape(np.random.default_rng(seed)))

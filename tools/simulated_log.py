@@ -6,7 +6,7 @@ One row per event, sorted by time stamp; empty cells mean "no sample at that tim
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,10 +32,12 @@ COLUMNS = (
     "pose_y_m",
     "pose_yaw_rad",
 )
+DIGITS = (6, 5, 5, 0, 0, 5, 5, 6)
+"""Digits behind the point of each column."""
 LARGEST_JITTER_PERIODS = 0.4
 SETTLING_S = 0.5
 
-Row = tuple[float, tuple[str, ...]]
+Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +90,8 @@ def simulated_log(
     effects: HiddenEffects | None = None,
     seed: int = 0,
     options: LogOptions | None = None,
-) -> list[Row]:
-    """Rows of the log, sorted by time stamp: (t_s, cells in the order of `COLUMNS`).
+) -> Floats:
+    """Rows (N, 8) of the log in the order of `COLUMNS`, sorted by time stamp, as exact as its file; NaN: no sample.
 
     Encoder counters start anywhere. `seed` decides the plant's noise and the time stamps, not the drive.
     """
@@ -104,41 +106,44 @@ def simulated_log(
     command_s = _delayed(drive.t_s, drive.period_s, options, generator)
     reading_period_s = 1.0 / options.encoder_rate_hz
     reading_s = _delayed(np.arange(0.0, drive.duration_s, reading_period_s), reading_period_s, options, generator)
-    rows = [
-        _row(stamp, command=(left, right))
-        for stamp, left, right in zip(
-            _stamped(command_s, drive.period_s, options, generator), drive.left_rad_s, drive.right_rad_s, strict=True
-        )
-    ]
+    stamps = _stamped(command_s, drive.period_s, options, generator)
     ticks, poses = _run(plant, drive, command_s, reading_s)
-    reading_stamps = _stamped(reading_s, reading_period_s, options, generator)
-    rows += [_row(stamp, ticks=pair) for stamp, pair in zip(reading_stamps, ticks, strict=True)]
+    stamps += _stamped(reading_s, reading_period_s, options, generator)
     pose_s = np.array([pose.sample_us for pose in poses], dtype=np.float64) * 1e-6
-    pose_stamps = _stamped(pose_s, 1.0 / parameters.pose_rate_hz, options, generator)
-    rows += [_row(stamp, pose=pose) for stamp, pose in zip(pose_stamps, poses, strict=True)]
-    return _one_at_a_time(sorted(rows, key=lambda row: row[0]))
+    stamps += _stamped(pose_s, 1.0 / parameters.pose_rate_hz, options, generator)
+    rows = np.full((len(stamps), len(COLUMNS)), np.nan)
+    first_reading, first_pose = len(command_s), len(command_s) + len(reading_s)
+    rows[:, 0] = stamps
+    rows[:first_reading, 1], rows[:first_reading, 2] = drive.left_rad_s, drive.right_rad_s
+    rows[first_reading:first_pose, 3:5] = ticks
+    rows[first_pose:, 5:] = np.reshape([(pose.x_m, pose.y_m, pose.yaw_rad) for pose in poses], (-1, 3))
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    rows[:, 0] = _apart(rows[:, 0])
+    for column, digits in enumerate(DIGITS[1:], 1):
+        rows[:, column] = [round(value, digits) for value in rows[:, column].tolist()]
+    return rows
 
 
-def _one_at_a_time(rows: Sequence[Row]) -> list[Row]:
-    """Sorted rows with those moved on by a microsecond that would be written with the time of the row before."""
-    separate: list[Row] = []
+def _apart(t_s: Floats) -> list[float]:
+    """Sorted times in whole microseconds, those moved on by one that would be the same as the time before."""
+    separate: list[float] = []
     last_us = -1
-    for t_s, cells in rows:
-        stamp_us = max(round(t_s * 1e6), last_us + 1)
-        separate.append((stamp_us * 1e-6, (f"{stamp_us * 1e-6:.6f}", *cells[1:])))
-        last_us = stamp_us
+    for value in t_s.tolist():
+        last_us = max(round(value * 1e6), last_us + 1)
+        separate.append(last_us * 1e-6)
     return separate
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
+def write_csv(path: Path, rows: Floats) -> None:
     """Write rows under a header of `COLUMNS`. Raises OSError."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
-        writer.writerows(cells for _, cells in rows)
+        for row in rows.tolist():
+            writer.writerow("" if math.isnan(v) else f"{v:.{digits}f}" for v, digits in zip(row, DIGITS, strict=True))
 
 
-def read_back(rows: Sequence[Row], ticks_per_rev: int) -> DriveLog:
+def read_back(rows: Floats, ticks_per_rev: int) -> DriveLog:
     """Rows as they are read from their CSV file."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
@@ -147,7 +152,7 @@ def read_back(rows: Sequence[Row], ticks_per_rev: int) -> DriveLog:
 
 
 def _run(
-    plant: Plant, drive: ScriptedDrive, command_s: npt.NDArray[np.float64], reading_s: npt.NDArray[np.float64]
+    plant: Plant, drive: ScriptedDrive, command_s: Floats, reading_s: Floats
 ) -> tuple[list[tuple[int, int]], list[PoseMeasurement]]:
     """Give each command at its time, read the encoders at theirs; collect ticks and poses."""
     command_us = np.round(command_s * 1e6).astype(np.int64).tolist()
@@ -168,31 +173,15 @@ def _run(
     return ticks, [pose for pose in poses if pose.sample_us <= last_us]
 
 
-def _delayed(
-    t_s: npt.NDArray[np.float64], period_s: float, options: LogOptions, generator: np.random.Generator
-) -> npt.NDArray[np.float64]:
+def _delayed(t_s: Floats, period_s: float, options: LogOptions, generator: np.random.Generator) -> Floats:
     """When things due at t_s really happen."""
     delay_s = generator.exponential(options.lateness_s, size=len(t_s)) if options.lateness_s > 0.0 else 0.0
     return t_s + np.minimum(delay_s, LARGEST_JITTER_PERIODS * period_s)
 
 
-def _stamped(
-    t_s: npt.NDArray[np.float64], period_s: float, options: LogOptions, generator: np.random.Generator
-) -> list[float]:
+def _stamped(t_s: Floats, period_s: float, options: LogOptions, generator: np.random.Generator) -> list[float]:
     """Time stamps of what happened at t_s; never before 0."""
     most_s = LARGEST_JITTER_PERIODS * period_s
     error_s = np.clip(options.stamp_jitter_s * generator.standard_normal(len(t_s)), -most_s, most_s)
     stamps: list[float] = np.maximum(t_s + error_s, 0.0).tolist()
     return stamps
-
-
-def _row(
-    t_s: float,
-    command: tuple[float, float] | None = None,
-    ticks: tuple[int, int] | None = None,
-    pose: PoseMeasurement | None = None,
-) -> Row:
-    command_cells = ("", "") if command is None else (f"{command[0]:.5f}", f"{command[1]:.5f}")
-    tick_cells = ("", "") if ticks is None else (str(ticks[0]), str(ticks[1]))
-    pose_cells = ("", "", "") if pose is None else (f"{pose.x_m:.5f}", f"{pose.y_m:.5f}", f"{pose.yaw_rad:.6f}")
-    return t_s, (f"{t_s:.6f}", *command_cells, *tick_cells, *pose_cells)

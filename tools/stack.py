@@ -25,6 +25,8 @@ _ROBOT_SILENT = "-> stopping: no wheel data"
 FAST_TASK = 'kind = "circle"\nradius_m = 3.0\nspeed_m_s = 0.45\n'
 # On the circle of FAST_TASK, facing along it: x, y (m) and a quarter turn.
 FAST_START = (3.0, 0.0, 1.5707963)
+CIRCLE_START = (0.75, 0.0, 1.5707963)
+"""The same of the shipped robot's circle."""
 
 
 @dataclass(frozen=True)

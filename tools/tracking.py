@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +17,8 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import believed_geometry
 from disco_hw.config import Estimation
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
-from disco_hw.control.baselines import Follower, Law, NominalRobot, Reference
+from disco_hw.control.baselines import Follower, Law, Reference
+from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import ROTATION
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
@@ -131,32 +131,6 @@ def fusion(mean: tuple[float, ...], spread: float = SPREAD) -> PoseFusion:
     return PoseFusion(Estimation(), OdometryParameters(*mean, tuple(map(tuple, rows))), 0.1)
 
 
-class Plant(Protocol):
-    """Plant to be driven: true pose and speed, the sensors' samples, and wheel speeds that are held for a while."""
-
-    @property
-    def now_ms(self) -> int:
-        """Time of the plant, ms."""
-
-    @property
-    def pose(self) -> tuple[float, float, float]:
-        """x, y (m), yaw (rad)."""
-
-    @property
-    def forward_m_s(self) -> float:
-        """Speed along the body."""
-
-    @property
-    def now_ns(self) -> int:
-        """Time of the plant, ns."""
-
-    def readings(self) -> Readings:
-        """Return the sensors' samples at this time."""
-
-    def advance(self, left_rad_s: float, right_rad_s: float, count: int, /) -> None:
-        """Hold these wheel speeds (rad/s) for `count` milliseconds."""
-
-
 @dataclass(frozen=True)
 class Contender:
     """A planner for a robot and a track; whether it knows the geometry and whether it learns it."""
@@ -172,8 +146,8 @@ def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contende
 
     def made(robot: ForeignRobot, track: Track) -> Planner:
         geometry = _geometry(robot, knows)
-        chassis = NominalRobot(*geometry, robot.lag_s, robot.dead_rad_s, LIMITS)
-        return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis)
+        chassis = SteeredChassis(*geometry, robot.lag_s, robot.dead_rad_s)
+        return Follower(Reference(track.points_m, speed_m_s, geometry[2]), law, chassis, LIMITS)
 
     return Contender(made, knows)
 
@@ -233,7 +207,7 @@ def drive(
     contender: Contender, robot: ForeignRobot, track: Track, *, rate_hz: float = 50.0, duration_s: float = DURATION_S,
     seed: int = 1, start: tuple[float, float, float] | None = None,
     listen: Callable[[Readings], object] = lambda readings: None,
-    plant_of: Callable[[ForeignRobot, tuple[float, float, float], int], Plant] = ForeignPlant,
+    plant_of: Callable[[ForeignRobot, tuple[float, float, float], int], ForeignPlant] = ForeignPlant,
 ) -> Drive:  # fmt: skip
     """One drive from rest; `listen` gets what the sensors say, `plant_of` makes the robot that is driven."""
     plant = plant_of(robot, start or track.start, seed)

@@ -10,8 +10,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,20 +47,13 @@ _WAIT_S = 0.05
 # Chosen: a flood on one topic must not hold up the others.
 _MAX_BATCH = 20
 
+_ACKNOWLEDGED = Policy.Reliability.Reliable(duration(milliseconds=5))
 SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
-RELIABLE = Qos(
-    Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.Volatile, Policy.History.KeepLast(10)
-)
-_LATCHED = Qos(
-    Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.TransientLocal, Policy.History.KeepLast(1)
-)
-
+RELIABLE = Qos(_ACKNOWLEDGED, Policy.Durability.Volatile, Policy.History.KeepLast(10))
+NEWEST = Qos(_ACKNOWLEDGED, Policy.Durability.Volatile, Policy.History.KeepLast(1))
+_LATCHED = Qos(_ACKNOWLEDGED, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
 _TRANSFORMS = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(100))
-_STATIC = Qos(
-    Policy.Reliability.Reliable(duration(milliseconds=5)),
-    Policy.Durability.TransientLocal,
-    Policy.History.KeepLast(100),
-)
+_STATIC = Qos(_ACKNOWLEDGED, Policy.Durability.TransientLocal, Policy.History.KeepLast(100))
 
 _PUBLISHED: tuple[tuple[str, type, Qos], ...] = (
     (out.ODOM, msg.Odometry, RELIABLE),
@@ -121,7 +115,8 @@ class Bridge:
         self._obstacle_link.setblocking(False)
         self._to_daemon = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._to_daemon.setblocking(False)
-        self._unsent = self._obstacles_unsent = self._malformed = self._unwritten = self._unread = 0
+        self._unsent = self._obstacles_unsent = self._unwritten = 0
+        self._unread = UnreadCounts()
         self._received_ns = self._next_diagnosis_ns = 0
         self._failure: BaseException | None = None
         self._ended = threading.Event()
@@ -209,25 +204,10 @@ class Bridge:
             while not self._ended.is_set():
                 waiting.wait(duration(milliseconds=50))
                 for reader, handle in self._readers:
-                    for message, sent_ns in self._samples(reader):
+                    for message, sent_ns in take_samples(reader, _MAX_BATCH, self._unread):
                         handle(message, sent_ns)
         except BaseException as failure:
             self._failure = failure
-
-    def _samples(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
-        """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
-        try:
-            samples = reader.take(_MAX_BATCH)
-        except DDSException:
-            self._unread += 1
-            return
-        except Exception:
-            # Whatever bytes a stranger sends under this type's name.
-            self._malformed += 1
-            return
-        for sample in samples:
-            if sample.sample_info.valid_data:
-                yield sample, sample.sample_info.source_timestamp
 
     def _handle_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
         publisher = _publisher_of(message)
@@ -302,19 +282,23 @@ class Bridge:
 
     def _diagnosis(self, mono_ns: int, wall_ns: int) -> out.Message:
         """Return the topic and the message of the bridge's diagnostics."""
-        figures = {"poses passed on": self._poses.passed, "poses not taken by the daemon": self._unsent}
-        figures |= {
-            f"poses refused: {why}": count for why, count in (self._poses.refused + self._transforms.refused).items()
+        poses, obstacles, speeds = self._poses, self._obstacles, self._speeds
+        figures = {
+            "poses passed on": poses.passed,
+            "poses not taken by the daemon": self._unsent,
+            **_refused("poses", poses.refused + self._transforms.refused),
+            "poses without a heading": poses.without_heading,
+            "obstacles passed on": obstacles.passed,
+            "obstacles not sent": self._obstacles_unsent,
+            **_refused("obstacles", obstacles.refused),
+            "speeds passed on": speeds.passed,
+            **_refused("speeds", speeds.refused),
+            "requests refused, too many": self._asking.refused + self._stopping.refused,
+            "messages that were none": self._unread.malformed,
+            "readers that failed": self._unread.failed,
+            "messages not sent": self._unwritten,
+            "batches of the daemon missed": self._feed.missed,
         }
-        figures |= {"poses without a heading": self._poses.without_heading}
-        figures |= {"obstacles passed on": self._obstacles.passed, "obstacles not sent": self._obstacles_unsent}
-        figures |= {f"obstacles refused: {why}": count for why, count in self._obstacles.refused.items()}
-        figures |= {"speeds passed on": self._speeds.passed}
-        figures |= {f"speeds refused: {why}": count for why, count in self._speeds.refused.items()}
-        figures |= {"requests refused, too many": self._asking.refused + self._stopping.refused}
-        figures |= {"messages that were none": self._malformed, "readers that failed": self._unread}
-        figures |= {"messages not sent": self._unwritten}
-        figures |= {"batches of the daemon missed": self._feed.missed}
         wrong = f"poses refused: {self._poses.why}" if self._poses.why else self._pad.refusal
         is_connected = mono_ns - self._received_ns < _SECOND_NS
         return self._outgoing.diagnostics(
@@ -327,6 +311,35 @@ class Bridge:
                 self._writers[topic].write(message)
         except DDSException:
             self._unwritten += 1
+
+
+def _refused(what: str, counts: Mapping[str, int]) -> dict[str, int]:
+    """Return counts by reason under their names in the diagnostics."""
+    return {f"{what} refused: {why}": count for why, count in counts.items()}
+
+
+@dataclass(slots=True)
+class UnreadCounts:
+    """Counts of failed reads: bytes that are no message of the reader's type, and failures of the reader itself."""
+
+    malformed: int = 0
+    failed: int = 0
+
+
+def take_samples(reader: DataReader[Any], most: int, unread: UnreadCounts) -> Iterator[tuple[Any, int]]:
+    """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
+    try:
+        samples = reader.take(most)
+    except DDSException:
+        unread.failed += 1
+        return
+    except Exception:
+        # Whatever bytes a stranger sends under this type's name.
+        unread.malformed += 1
+        return
+    for sample in samples:
+        if sample.sample_info.valid_data:
+            yield sample, sample.sample_info.source_timestamp
 
 
 def _publisher_of(message: Any) -> str | None:

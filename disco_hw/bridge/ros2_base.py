@@ -14,6 +14,7 @@ import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +22,16 @@ from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
-from cyclonedds.util import duration
 
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2 import RELIABLE, SENSOR, join_domain, wire_name
+from disco_hw.bridge.ros2 import NEWEST, RELIABLE, SENSOR, UnreadCounts, join_domain, take_samples, wire_name
 from disco_hw.bridge.ros2_inlets import WheelInlet
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon import peer_uid
 from disco_hw.daemon.process import StopSignals
 from disco_hw.errors import InputError
 from drivers.motor import ros2_base_wire as wire
-from drivers.private_files import why_not_private
-from drivers.private_socket import SocketPathError, bind_private
+from drivers.private_files import SocketPathError, bind_private, why_not_private
 from drivers.types import Frame
 
 INTERFACE = "unixcan"
@@ -52,9 +51,6 @@ _FRESH_NS, _OTHERS_NS = 250_000_000, 1_000_000_000
 _MOST_CLIENTS, _MAX_BATCH = 8, 64
 # User id of the superuser (POSIX).
 _ROOT = 0
-_SPEED_QOS = Qos(
-    Policy.Reliability.Reliable(duration(milliseconds=5)), Policy.Durability.Volatile, Policy.History.KeepLast(1)
-)
 _OTHERS_QOS = Qos(
     Policy.Reliability.BestEffort,
     Policy.Durability.Volatile,
@@ -170,7 +166,7 @@ class BaseBridge:
         def topic(name: str, kind: Any) -> Topic[Any]:
             return Topic(self._participant, wire_name(name, config.ros2.namespace), kind)
 
-        self._writer = DataWriter(self._participant, topic(settings.speed_topic, speed), _SPEED_QOS)
+        self._writer = DataWriter(self._participant, topic(settings.speed_topic, speed), NEWEST)
         self._others = DataReader(self._participant, topic(settings.speed_topic, speed), _OTHERS_QOS)
         self._wheels = DataReader(self._participant, topic(settings.wheels_from, wheels), SENSOR)
         buttons = topic(settings.stop_topic, msg.Bool) if settings.stop_topic else None
@@ -178,7 +174,7 @@ class BaseBridge:
         self.end.receives_button = self._button is None
         self._others_ns = self._wheels_ns = -_OTHERS_NS
         self._step_ns = self._state_ns = self._look_ns = 0
-        self._unreadable = self._unwritten = 0
+        self._unread, self._unwritten = UnreadCounts(), 0
         self._last_line = ""
 
     def run(self, should_stop: Callable[[], bool]) -> None:
@@ -236,10 +232,10 @@ class BaseBridge:
 
     def _handle_button(self, reader: DataReader[Any]) -> None:
         """Read the base's stop button; an unreadable message or no publisher ends driving, as a pressed one does."""
-        unreadable = self._unreadable
+        before = replace(self._unread)
         for message, _ in self._samples(reader):
             self.end.button, self.end.receives_button = message.data, True
-        if self._unreadable != unreadable or not reader.get_matched_publications():
+        if self._unread != before or not reader.get_matched_publications():
             self.end.receives_button = False
 
     def _send_due(self, now_ns: int) -> None:
@@ -273,16 +269,7 @@ class BaseBridge:
             self._unwritten += 1
 
     def _samples(self, reader: DataReader[Any]) -> Iterator[tuple[Any, int]]:
-        """Yield a reader's valid samples with their source time stamps; count those that cannot be read."""
-        try:
-            samples = reader.take(_MAX_BATCH)
-        except Exception:
-            # Whatever bytes a stranger sends under this type's name.
-            self._unreadable += 1
-            return
-        for sample in samples:
-            if sample.sample_info.valid_data:
-                yield sample, sample.sample_info.source_timestamp
+        return take_samples(reader, _MAX_BATCH, self._unread)
 
     def _print_state(self) -> None:
         """Print a line for the operator at each change."""
@@ -299,7 +286,7 @@ class BaseBridge:
         ]
         counts = {
             "messages refused": sum(self._inlet.refused.values()),
-            "messages that were none": self._unreadable,
+            "messages that were none": self._unread.malformed + self._unread.failed,
             "speeds not sent": self._unwritten,
         }
         line = "; ".join(parts)

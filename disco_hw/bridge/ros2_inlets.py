@@ -107,9 +107,7 @@ class PoseInlet:
             "y_m": place.y,
             "position_std_m": math.sqrt(max(xx, yy)) or settings.position_std_m,
         }
-        yaw = math.atan2(
-            2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
-        )
+        yaw = msg.yaw_of(turned)
         # Where no covariance says that the heading is unknown, the daemon sees whether it stands still.
         if spread is None or is_heading_measured(yaw, tt):
             found |= {"yaw_rad": yaw, "yaw_std_rad": math.sqrt(tt) or settings.yaw_std_rad}
@@ -220,8 +218,7 @@ class TransformInlet:
         covariance = [0.0] * 36
         covariance[0] = covariance[7] = (scale * position) ** 2
         covariance[35] = (scale * heading) ** 2
-        turned = msg.Quaternion(0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw))
-        pose = msg.PoseWithCovariance(msg.RosPose(msg.Point(x, y, 0.0), turned), covariance)
+        pose = msg.PoseWithCovariance(msg.RosPose(msg.Point(x, y, 0.0), msg.about_z(yaw)), covariance)
         return msg.PoseWithCovarianceStamped(msg.Header(msg.stamp_of(t_ns), self._settings.frame), pose)
 
     def _motion(self, child: str, only_ns: int | None) -> Motion:
@@ -333,8 +330,5 @@ def _means(sides: tuple[tuple[str, ...], tuple[str, ...]], at: dict[str, int], v
 
 
 def _planar(message: msg.Odometry) -> tuple[float, float, float]:
-    place, turned = message.pose.pose.position, message.pose.pose.orientation
-    yaw = math.atan2(
-        2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
-    )
-    return place.x, place.y, yaw
+    pose = message.pose.pose
+    return pose.position.x, pose.position.y, msg.yaw_of(pose.orientation)

@@ -5,6 +5,7 @@ A type `nav_msgs/msg/Odometry` is `nav_msgs::msg::dds_::Odometry_` on the wire, 
 
 # No `from __future__ import annotations`: cyclonedds reads the annotations as the classes are made.
 
+import math
 from dataclasses import dataclass, field
 
 from cyclonedds.idl import IdlStruct
@@ -249,6 +250,18 @@ class ObstacleArrayMsg(IdlStruct, typename="costmap_converter_msgs::msg::dds_::O
 
     header: Header = field(default_factory=Header)
     obstacles: sequence[ObstacleMsg] = field(default_factory=list)
+
+
+def about_z(yaw_rad: float) -> Quaternion:
+    """Return the rotation by a yaw, counter-clockwise."""
+    return Quaternion(0.0, 0.0, math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad))
+
+
+def yaw_of(turned: Quaternion) -> float:
+    """Return the yaw of a rotation in rad, in (-pi, pi]."""
+    return math.atan2(
+        2.0 * (turned.w * turned.z + turned.x * turned.y), 1.0 - 2.0 * (turned.y * turned.y + turned.z * turned.z)
+    )
 
 
 def stamp_of(time_ns: int) -> Time:

@@ -182,14 +182,12 @@ class Outgoing:
         return msg.RosPath(header, [msg.PoseStamped(header, _pose(*point)) for point in points])
 
     def _transform(self, parent: str, child: str, at: tuple[float, float, float], wall_ns: int) -> msg.TransformStamped:
-        pose = _pose(*at)
-        place = msg.Transform(msg.Vector3(at[0], at[1], 0.0), pose.orientation)
+        place = msg.Transform(msg.Vector3(at[0], at[1], 0.0), msg.about_z(at[2]))
         return msg.TransformStamped(msg.Header(msg.stamp_of(wall_ns), parent), child, place)
 
 
 def _pose(x_m: float, y_m: float, yaw_rad: float) -> msg.RosPose:
-    half = 0.5 * yaw_rad
-    return msg.RosPose(msg.Point(x_m, y_m, 0.0), msg.Quaternion(0.0, 0.0, math.sin(half), math.cos(half)))
+    return msg.RosPose(msg.Point(x_m, y_m, 0.0), msg.about_z(yaw_rad))
 
 
 def _six(covariance: Matrix3) -> list[float]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Protocol, runtime_checkable
 
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_continuous_are
 
+from disco_hw.control.disco import Disco
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import (
     CommandLimits,
@@ -42,21 +43,10 @@ Array = NDArray[np.float64]
 _LONGEST_GAP_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class NominalRobot:
-    """Nominal properties of the robot: geometry (m), motor lag (s), dead band (rad/s) and the drive's limits."""
-
-    wheel_radius_m: float
-    axial_distance_m: float
-    x_icr_m: float
-    lag_s: float
-    dead_rad_s: float
-    limits: CommandLimits
-
-    def wheels(self, forward_m_s: float, turn_rad_s: float) -> Array:
-        """Wheel speeds (2,) of a motion."""
-        half = 0.5 * self.axial_distance_m * turn_rad_s
-        return np.array([forward_m_s - half, forward_m_s + half]) / self.wheel_radius_m
+def wheels_of(chassis: SteeredChassis, forward_m_s: float, turn_rad_s: float) -> Array:
+    """Wheel speeds (2,), left and right (rad/s), of a motion."""
+    half = 0.5 * chassis.axial_distance_m * turn_rad_s
+    return np.array([forward_m_s - half, forward_m_s + half]) / chassis.wheel_radius_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,29 +65,14 @@ class Errors:
     sum_m_s: float
 
 
-class Law(Protocol):
-    """Protocol of a steering law: it corrects the turning rate and speed of a reference motion."""
-
-    @property
-    def preview_s(self) -> float:
-        """Time (s) by which the reference motion is taken ahead of the robot."""
-
-    @property
-    def largest_sum_m_s(self) -> float:
-        """Bound of the distance's integral."""
-
-    def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
-        """Return the correction to add to the reference's turning rate (rad/s), and the factor of its forward speed."""
-
-
 class Follower:
     """Drives a line by a steering law: a planner without a belief.
 
     The reference's wheel speeds are led by what the motors lag, and lifted over the dead band.
     """
 
-    def __init__(self, reference: Reference, law: Law, chassis: NominalRobot) -> None:
-        self._reference, self._law, self._chassis = reference, law, chassis
+    def __init__(self, reference: Reference, law: Law, chassis: SteeredChassis, limits: CommandLimits) -> None:
+        self._reference, self._law, self._chassis, self._limits = reference, law, chassis, limits
         self.reset()
 
     def reset(self) -> None:
@@ -106,14 +81,9 @@ class Follower:
         self._sum_m_s = 0.0
         self._last_ns: int | None = None
 
-    @property
-    def x_icr_m(self) -> float:
-        """Place (m) of the centre of rotation ahead of the tracked point, for which the line's headings are made."""
-        return self._chassis.x_icr_m
-
-    def set_chassis(self, chassis: NominalRobot) -> None:
-        """Steer this robot from now on."""
-        self._chassis = chassis
+    def set_chassis(self, chassis: SteeredChassis) -> None:
+        """Steer this robot from now on; the line's headings, and the centre of rotation that they are for, stay."""
+        self._chassis = chassis._replace(x_icr_m=self._chassis.x_icr_m)
 
     def watch(self, state: PlannerState) -> None:
         """Update only the place on the line while something else drives.
@@ -134,16 +104,15 @@ class Follower:
         add, factor = law.turn(reference, errors, state.x_m, state.y_m, state.yaw_rad)
         wheels = self._reference_wheels(here)
         change = (self._reference_wheels(there) - wheels) / 0.1
-        now = chassis.wheels(reference.forward_m_s[here] * factor, reference.turn_rad_s[here] + add)
-        commands = now + chassis.lag_s * change
+        now = wheels_of(chassis, reference.forward_m_s[here] * factor, reference.turn_rad_s[here] + add)
+        commands = now + chassis.response_s * change
         commands += np.copysign(chassis.dead_rad_s, commands) * np.minimum(np.abs(commands) / 0.05, 1.0)
         # Too fast for a wheel: as fast as it can, on the same curve.
-        commands /= max(1.0, float(np.abs(commands).max()) / chassis.limits.speed_rad_s)
-        base = chassis.wheel_radius_m, chassis.axial_distance_m, chassis.x_icr_m
-        return constant_plan(now_ns, state, float(commands[0]), float(commands[1]), base)
+        commands /= max(1.0, float(np.abs(commands).max()) / self._limits.speed_rad_s)
+        return constant_plan(now_ns, state, float(commands[0]), float(commands[1]), chassis[:3])
 
     def _reference_wheels(self, place: int) -> Array:
-        return self._chassis.wheels(self._reference.forward_m_s[place], self._reference.turn_rad_s[place])
+        return wheels_of(self._chassis, self._reference.forward_m_s[place], self._reference.turn_rad_s[place])
 
     def _errors(self, now_ns: int, place: int, state: PlannerState) -> Errors:
         reference, x_icr = self._reference, self._chassis.x_icr_m
@@ -178,47 +147,27 @@ SPACING_M = 0.01
 LOOK_BACK_M, LOOK_AHEAD_M = 0.3, 0.6
 
 
-@dataclass(frozen=True, eq=False)
 class Reference:
     """Way-points (N, 2) m driven at `speed_m_s` by a robot of this `x_icr_m`; closed if the last one is the first.
 
     `places_m` (M, 2), `along_rad`, `yaw_rad`, `forward_m_s` and `turn_rad_s` (M,) at equal distances `spacing_m`.
     """
 
-    waypoints_m: Array
-    speed_m_s: float
-    x_icr_m: float
-    places_m: Array = field(init=False, repr=False)
-    along_rad: Array = field(init=False, repr=False)
-    yaw_rad: Array = field(init=False, repr=False)
-    forward_m_s: Array = field(init=False, repr=False)
-    turn_rad_s: Array = field(init=False, repr=False)
-    spacing_m: float = field(init=False, repr=False)
-    closed: bool = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        behind = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(self.waypoints_m, axis=0).T))])
+    def __init__(self, waypoints_m: Array, speed_m_s: float, x_icr_m: float) -> None:
+        self.speed_m_s, self.x_icr_m = speed_m_s, x_icr_m
+        behind = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(waypoints_m, axis=0).T))])
         count = max(round(float(behind[-1]) / SPACING_M), 2)
         at = np.linspace(0.0, behind[-1], count + 1)
-        places = np.column_stack([np.interp(at, behind, column) for column in self.waypoints_m.T])
+        places = np.column_stack([np.interp(at, behind, column) for column in waypoints_m.T])
         steps = np.diff(places, axis=0)
-        along = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
-        spacing = float(behind[-1]) / count
-        closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
-        yaw = stable_yaw(along, spacing, self.x_icr_m, closed)[:-1]
-        off = np.clip(yaw - along, -0.5 * math.pi, 0.5 * math.pi)
-        x_icr_m = math.copysign(max(abs(self.x_icr_m), SMALLEST_X_ICR_M), self.x_icr_m)
-        values = {
-            "places_m": places[:-1],
-            "along_rad": along,
-            "yaw_rad": yaw,
-            "forward_m_s": self.speed_m_s * np.cos(off),
-            "turn_rad_s": self.speed_m_s * np.sin(off) / x_icr_m,
-            "spacing_m": spacing,
-            "closed": closed,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        self.places_m = places[:-1]
+        self.spacing_m = float(behind[-1]) / count
+        self.closed = bool(np.hypot(*(places[0] - places[-1])) < SPACING_M)
+        self.along_rad = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+        self.yaw_rad = stable_yaw(self.along_rad, self.spacing_m, x_icr_m, self.closed)[:-1]
+        off = np.clip(self.yaw_rad - self.along_rad, -0.5 * math.pi, 0.5 * math.pi)
+        self.forward_m_s = speed_m_s * np.cos(off)
+        self.turn_rad_s = speed_m_s * np.sin(off) / math.copysign(max(abs(x_icr_m), SMALLEST_X_ICR_M), x_icr_m)
 
     def place(self, x_m: float, y_m: float, before: int | None) -> int:
         """Index of the place nearest to a position, near the one before."""
@@ -318,6 +267,11 @@ class LinearQuadratic:
         return -reference.speed_m_s * correction, max(math.cos(errors.yaw_rad), 0.2)
 
 
+Law = PurePursuit | Kanayama | LinearQuadratic
+"""A steering law. `preview_s`: the time (s) by which the reference motion is taken ahead of the robot;
+`largest_sum_m_s`: bound of the distance's integral. `turn` returns the correction to add to the reference's turning
+rate (rad/s), and the factor of its forward speed."""
+
 LAWS: Mapping[str, Callable[[], Law]] = MappingProxyType(
     {"pure_pursuit": PurePursuit, "kanayama": Kanayama, "lqr": LinearQuadratic}
 )
@@ -336,39 +290,6 @@ class Line(Protocol):
         """Return the line's points (N, 2) in the order of the drive; the last is the first where it is closed."""
 
 
-class BelievedPlanner(Protocol):
-    """A planner that says which robot it plans for."""
-
-    @property
-    def chassis(self) -> SteeredChassis:
-        """The mean of what is believed."""
-
-    def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """Plan from the state; raises NoValidControl."""
-
-    def reset(self) -> None:
-        """Forget the last plan."""
-
-    def set_task(self, task: PlannedTask) -> None:
-        """Plan for another task of the same kind."""
-
-    def set_belief(self, belief: Belief) -> None:
-        """Plan under this belief; raises ValueError."""
-
-    @property
-    def is_trapped(self) -> bool:
-        """Whether the last plan found no way past the fence or an obstacle."""
-
-    def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
-        """Keep away from these boundaries from the next plan on."""
-
-    def set_line(self, line_m: Array) -> None:
-        """Drive around what stands on this line, points (N, 2)."""
-
-    def sampled_rollouts(self, count: int) -> Rollouts:
-        """Return the weightiest sequences of the last plan."""
-
-
 class WithFallback:
     """Plans as `planner` does; where that finds nothing valid, a follower by `law` drives on along the line.
 
@@ -377,9 +298,7 @@ class WithFallback:
     TypeError for a task without a line.
     """
 
-    def __init__(
-        self, planner: BelievedPlanner, law: Callable[[], Law], task: PlannedTask, limits: CommandLimits
-    ) -> None:
+    def __init__(self, planner: Disco, law: Callable[[], Law], task: PlannedTask, limits: CommandLimits) -> None:
         self._planner, self._law, self._limits = planner, law, limits
         self._follower = self._along(task)
 
@@ -387,10 +306,7 @@ class WithFallback:
         if not isinstance(task, Line):
             raise TypeError(f"{type(task).__name__} has no line that a follower could drive")
         reference = Reference(task.line_m(), task.speed_m_s, self._planner.chassis.x_icr_m)
-        return Follower(reference, self._law(), self._chassis())
-
-    def _chassis(self) -> NominalRobot:
-        return NominalRobot(*self._planner.chassis, self._limits)
+        return Follower(reference, self._law(), self._planner.chassis, self._limits)
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
         """Return the planner's plan, or the follower's; raises NoValidControl where neither can be."""
@@ -427,7 +343,7 @@ class WithFallback:
     def set_belief(self, belief: Belief) -> None:
         """Plan under this belief, and steer a robot of its mean; the line's headings stay. Raises ValueError."""
         self._planner.set_belief(belief)
-        self._follower.set_chassis(replace(self._chassis(), x_icr_m=self._follower.x_icr_m))
+        self._follower.set_chassis(self._planner.chassis)
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
         """Let the planner keep away from these boundaries; the law knows nothing of them, and the guard stops it."""

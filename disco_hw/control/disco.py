@@ -16,7 +16,6 @@ import math
 import numpy as np
 
 from disco_hw.control.disturbance_compensation import DisturbanceCompensation
-from disco_hw.control.guidance import Guidance
 from disco_hw.control.kernel import BLOCK, CHANNELS, START_LEFT, START_RIGHT, START_SIZE, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.avoid import Area
 from disco_hw.control.kernel.guide import SteeredChassis
@@ -34,9 +33,8 @@ from disco_hw.control.plan import (
 )
 from disco_hw.control.refinement import Refinement
 from disco_hw.control.rollout_points import RolloutPoints
-from disco_hw.control.sampling import Sampling
+from disco_hw.control.sampling import Guidance, Sampling, Stopping, ramp_to_zero
 from disco_hw.control.state_prediction import PlanStart, StatePrediction
-from disco_hw.control.stopping import Stopping, ramp_to_zero
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief, Model
@@ -51,6 +49,8 @@ REFINED = (PlanOutcome.PLANNED, PlanOutcome.RETRIED)
 class Disco:
     """Plans wheel speeds for a task.
 
+    To look at: its `task`, `settings`, `optimiser` with its buffers and figures, and `refinement`, None without one.
+
     Pure: no clock, no thread, and the same seed, calls and states give the same plans bit for bit. The first call
     compiles; `warm_up` does that beforehand.
     """
@@ -59,20 +59,20 @@ class Disco:
         self, model: Model, task: PlannedTask, settings: DiscoSettings, limits: CommandLimits, seed: int = 1,
         surroundings: Surroundings | None = None,
     ) -> None:  # fmt: skip
-        self._task, self._settings, self._surroundings = task, settings, surroundings
+        self.task, self.settings, self._surroundings = task, settings, surroundings
         self._points = points = RolloutPoints(model, settings, limits, seed)
         self._limits = limits
         self._compensation = DisturbanceCompensation(points, settings.offset_free)
         self._prediction = StatePrediction(points, self._compensation, settings, limits)
         sampler, change = settings.sampler, limits.acceleration_rad_s2 * settings.step_s
-        self._optimiser = Optimiser(
+        self.optimiser = Optimiser(
             sampler, CHANNELS, points.weights.size, points.history, limits.speed_rad_s, change, seed
         )
-        self._guidance = Guidance(self._optimiser, settings)
-        self._sampling = Sampling(self._optimiser, points.weights, settings, surroundings)
+        self._guidance = Guidance(self.optimiser, settings)
+        self._sampling = Sampling(self.optimiser, points.weights, settings, surroundings)
         # With an estimated disturbance, which changes in every tick, refined commands would be restless.
         is_refined = settings.refine and not settings.offset_free
-        self._refinement = Refinement(limits, settings, points.history) if is_refined else None
+        self.refinement = Refinement(limits, settings, points.history) if is_refined else None
         self._set_refined_model()
         self._stopping = Stopping(settings, limits)
         # Buffers of the compiled rollout: where it begins, and how the wheels turn in it.
@@ -80,35 +80,15 @@ class Disco:
         self._wheels = aligned_zeros(sampler.horizon * WHEEL_ROWS * int(BLOCK))
         # Of the first plan since the last reset, and of the last one.
         self._begun_ns: int | None = None
-        self._t0_ns: int | None = None
+        self._last_ns: int | None = None
         # What the task carries along from plan to plan.
         self._memory: float | None = None
         self._begin = PlanStart.at_rest(points.history)
 
     @property
-    def task(self) -> PlannedTask:
-        """The task that is planned for."""
-        return self._task
-
-    @property
     def chassis(self) -> SteeredChassis:
         """The robot in the mean of what is believed."""
         return self._points.chassis
-
-    @property
-    def settings(self) -> DiscoSettings:
-        """The settings that plans are made with."""
-        return self._settings
-
-    @property
-    def optimiser(self) -> Optimiser:
-        """The sampling optimiser, for its buffers and figures."""
-        return self._optimiser
-
-    @property
-    def refinement(self) -> Refinement | None:
-        """The refinement of plans beside the line; None where the settings have none."""
-        return self._refinement
 
     @property
     def is_trapped(self) -> bool:
@@ -128,9 +108,9 @@ class Disco:
 
     def set_task(self, task: PlannedTask) -> None:
         """Plan for another task of the same type from the next `plan` on; nothing is compiled. Raises TypeError."""
-        if type(task) is not type(self._task):
-            raise TypeError(f"the planner was compiled for {type(self._task).__name__}, not {type(task).__name__}")
-        self._task = task
+        if type(task) is not type(self.task):
+            raise TypeError(f"the planner was compiled for {type(self.task).__name__}, not {type(task).__name__}")
+        self.task = task
         self.reset()
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
@@ -148,43 +128,42 @@ class Disco:
 
     def reset(self) -> None:
         """Forget the last plan, as at a new start; the random numbers go on."""
-        self._begun_ns = self._t0_ns = self._memory = None
-        self._optimiser.reset()
+        self._begun_ns = self._last_ns = self._memory = None
+        self.optimiser.reset()
         self._guidance.reset()
         self._stopping.end()
         self._compensation.pause()
-        if self._refinement is not None:
-            self._refinement.reset()
+        if self.refinement is not None:
+            self.refinement.reset()
 
     def warm_up(self) -> None:
         """Compile everything that any method calls, or load it from disk; leaves the planner as after `reset`."""
-        number = self._optimiser.step_number
+        number = self.optimiser.step_number
         self.reset()
         self.plan(0, PlannerState(0, 0.0, 0.0, 0.0, 0.0, 0.0))
         self.sampled_rollouts(1)
         self.point_trajectories()
-        self._optimiser.step_number = number
+        self.optimiser.step_number = number
         self.reset()
 
     def plan(self, now_ns: int, state: PlannerState) -> WheelPlan:
-        """Plan from the state, predicted to when a command made from it acts.
+        """Plan from the state, predicted to `now_ns`.
 
         A step without a valid result is tried again, then planned anew from standstill, then answered with a ramp to
         zero for `decay_s`; after that NoValidControl is raised. Plans and commands are finite in any case.
         """
-        settings, optimiser, sampling = self._settings, self._optimiser, self._sampling
-        # When the plan begins, and how long after the last one.
-        t0_ns, last_ns = now_ns + round(settings.latency_s * 1e9), self._t0_ns
+        settings, optimiser, sampling = self.settings, self.optimiser, self._sampling
+        # How long after the first plan and after the last one.
         begun_ns = self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
-        task_s = (t0_ns - begun_ns) * 1e-9
-        elapsed_s = task_s if state.elapsed_s is None else state.elapsed_s + settings.latency_s
-        shift_steps = 0.0 if last_ns is None else max((t0_ns - last_ns) * 1e-9 / settings.step_s, 0.0)
+        task_s, last_ns = (now_ns - begun_ns) * 1e-9, self._last_ns
+        elapsed_s = task_s if state.elapsed_s is None else state.elapsed_s
+        shift_steps = 0.0 if last_ns is None else max((now_ns - last_ns) * 1e-9 / settings.step_s, 0.0)
 
         # Where it begins, and what is rolled out from there.
         self._compensation.follow(now_ns, state)
-        begin = self._prediction.start(state, t0_ns, elapsed_s)
+        begin = self._prediction.start(state, now_ns, elapsed_s)
         system = self._system(state, begin, task_s)
-        self._t0_ns = t0_ns
+        self._last_ns = now_ns
 
         # Sample around the last plan, roll out, weigh, update; stop where nothing helps.
         guided = self._guidance.offer(system, self.chassis, begin.before)
@@ -208,23 +187,23 @@ class Disco:
             nominal = optimiser.nominal()
             trajectory = begin.mean_path(self._points.mean_run, nominal)
         elif refined is not None:
-            return WheelPlan(t0_ns, settings.step_s, *refined, diagnostics)
-        return WheelPlan(t0_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
+            return WheelPlan(now_ns, settings.step_s, *refined, diagnostics)
+        return WheelPlan(now_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
 
     def _system(self, state: PlannerState, begin: PlanStart, task_s: float) -> SkidSteer:
         """Return what the compiled step rolls out: f_theta from the plan's start, and the task's cost."""
-        points, settings = self._points, self._settings
+        points, settings = self._points, self.settings
         x, y, yaw, left, right = begin.state.tolist()
-        task, (origin_x, origin_y), place, self._memory = self._task.prepare(
+        task, (origin_x, origin_y), place, self._memory = self.task.prepare(
             task_s, x, y, yaw, self._memory, settings.step_s, settings.sampler.horizon, points.chassis.x_icr_m
         )
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
         slides = self._compensation.slides_in(settings.step_s)
         self._start[:] = x - origin_x, y - origin_y, *direction, left, right, begin.elapsed_s, place, *slides
         if points.history:
-            self._optimiser.set_command_history(begin.earlier)
+            self.optimiser.set_command_history(begin.earlier)
         if points.is_sampled:
-            points.draw(self._optimiser.step_number, self._optimiser.padded_samples)
+            points.draw(self.optimiser.step_number, self.optimiser.padded_samples)
         means = None if begin.point_means is None else begin.point_means.astype(np.float32)
         return SkidSteer(
             self._start, True if settings.offset_free else None, means, points.base, points.effects, points.each,
@@ -243,31 +222,31 @@ class Disco:
     def _stop(self, now_ns: int, begin: PlanStart) -> None:
         """Put a ramp to zero in the plan's place; raises NoValidControl when that has gone on for too long."""
         try:
-            self._optimiser.set_nominal(self._stopping.ramp(now_ns, begin.before, self.is_trapped))
+            self.optimiser.set_nominal(self._stopping.ramp(now_ns, begin.before, self.is_trapped))
         except NoValidControl:
-            self._optimiser.reset()
+            self.optimiser.reset()
             raise
 
     def _is_guided(self, now_ns: int, system: SkidSteer, trajectory: Array) -> bool:
         """Whether the guide has the robot, whatever the plan costs."""
-        if not self._optimiser.guide_is_valid or self._sampling.guide_touches:
+        if not self.optimiser.guide_is_valid or self._sampling.guide_touches:
             return False
         return self._guidance.has_robot(now_ns, system, trajectory)
 
     def _set_refined_model(self) -> None:
         """Refine in the mean of the belief in force."""
-        if self._refinement is not None:
-            self._refinement.set_model(self._points.model, self._points.chassis)
+        if self.refinement is not None:
+            self.refinement.set_model(self._points.model, self._points.chassis)
 
     def _speed_part(self, outcome: PlanOutcome) -> float:
         """Return the part of the task's speed that the wheels can do ahead; 1 where no refinement was tried."""
-        return 1.0 if self._refinement is None or outcome not in REFINED else self._refinement.speed_part
+        return 1.0 if self.refinement is None or outcome not in REFINED else self.refinement.speed_part
 
     def _refined(self, begin: PlanStart, system: SkidSteer, nominal: Array) -> tuple[Array, Array] | None:
         """Return the refined commands (N, 2), as the robot is to get them, and where they lead; None without such."""
-        if self._refinement is None:
+        if self.refinement is None:
             return None
-        commands = self._refinement.improve(system.task, system.start, begin, nominal)
+        commands = self.refinement.improve(system.task, system.start, begin, nominal)
         if commands is None:
             return None
         # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
@@ -280,7 +259,7 @@ class Disco:
         """Whether a robot that does this and then stops keeps clear of the fence and obstacles under every point."""
         if self._surroundings is None:
             return True
-        limits, step_s, points = self._limits, self._settings.step_s, self._points
+        limits, step_s, points = self._limits, self.settings.step_s, self._points
         stop_steps = math.ceil(np.abs(commands[-1]).max() / (limits.acceleration_rad_s2 * step_s)) + 1
         stopped = np.concatenate([commands, ramp_to_zero(commands[-1], limits, step_s, stop_steps)])
         runs = [begin.point_path(points.run, stopped, point) for point in range(points.weights.size)]
@@ -293,8 +272,8 @@ class Disco:
         A look from outside: takes under a millisecond for 50, and changes no plan. Empty before the first plan and when
         the last one is a ramp to zero.
         """
-        commands, weights = self._optimiser.sampled_commands(count)
-        trajectories = np.empty((len(commands), self._settings.sampler.horizon + 1, 3))
+        commands, weights = self.optimiser.sampled_commands(count)
+        trajectories = np.empty((len(commands), self.settings.sampler.horizon + 1, 3))
         for row, one in enumerate(commands):
             trajectories[row] = self._begin.mean_path(self._points.mean_run, one)
         return Rollouts(np.array([self._compensation.commanded(one) for one in commands]), trajectories, weights)
@@ -304,5 +283,5 @@ class Disco:
 
         As cheap as `sampled_rollouts`, and changes no plan.
         """
-        points, nominal = self._points, self._optimiser.nominal()
+        points, nominal = self._points, self.optimiser.nominal()
         return np.array([self._begin.point_path(points.run, nominal, point) for point in range(points.weights.size)])

@@ -22,10 +22,7 @@ def spline_basis(knots: int, horizon: int) -> tuple[NDArray[np.int64], NDArray[n
     """Clamped uniform cubic B-spline basis at the middle of each of `horizon` steps.
 
     Returns the first of the four control points that act at each step (T,) and their weights (T, 4), which sum to one.
-    Raises ValueError for fewer than four knots.
     """
-    if knots <= DEGREE:
-        raise ValueError(f"a cubic spline needs at least {DEGREE + 1} knots, not {knots}")
     inner = np.linspace(0.0, 1.0, knots - DEGREE + 1)
     vector = np.concatenate([np.zeros(DEGREE), inner, np.ones(DEGREE)])
     middles = (np.arange(horizon) + 0.5) / horizon
@@ -51,7 +48,8 @@ class Optimiser:
     """Improves a command sequence (T, C) by sampling around it; all randomness is in `seed` and the step number.
 
     `points`: parameter points that every sample is costed under. `history`: steps of commands from before the plan that
-    the system looks back on. `largest`, `change`: bound of a command and of its change in a step.
+    the system looks back on. `largest`, `change`: bound of a command and of its change in a step, kept in `limits`.
+    `work`: the buffers, as the last step left them.
     """
 
     def __init__(
@@ -68,7 +66,7 @@ class Optimiser:
         padded = blocks * int(BLOCK)
         self.step_number = 0
         self._before = np.zeros(channels, f32)
-        self._limits = Limits(single(largest), single(min(change, 4.0 * largest)), self._before)
+        self.limits = Limits(single(largest), single(min(change, 4.0 * largest)), self._before)
         commands_size = (history + horizon) * channels * int(BLOCK)
         self._samplings = np.zeros(1, SAMPLING)
         self._samplings[0] = (
@@ -88,7 +86,7 @@ class Optimiser:
             sampler.control_cost_weight / sampler.noise_std**2,
             {"mean": 1.0, "cvar": sampler.worst_part, "worst": 1e-6}[sampler.risk],
         )
-        self._work = Workspace(
+        self.work = Workspace(
             nominal=np.zeros((horizon, channels), f32),
             guide=np.zeros((horizon, channels), f32),
             updated=np.zeros((horizon, channels), f32),
@@ -113,61 +111,51 @@ class Optimiser:
 
     def reset(self) -> None:
         """Clear the plan but continue the sequence of random numbers."""
-        self._work.nominal[:] = 0.0
+        self.work.nominal[:] = 0.0
         self._valid = False
-        self._work.report[TEMPERATURE] = FIRST_TEMPERATURE
-
-    @property
-    def work(self) -> Workspace:
-        """The buffers, as the last step left them."""
-        return self._work
+        self.work.report[TEMPERATURE] = FIRST_TEMPERATURE
 
     @property
     def padded_samples(self) -> int:
         """Samples with the idle ones of the last block: K'."""
-        return int(self._work.costs.size)
+        return int(self.work.costs.size)
 
     def nominal(self) -> Array:
         """Return a read-only copy of the plan, (T, C)."""
-        copy: Array = self._work.nominal.astype(np.float64)
+        copy: Array = self.work.nominal.astype(np.float64)
         copy.setflags(write=False)
         return copy
 
     def set_nominal(self, commands: Array) -> None:
         """Continue from this plan, (T, C)."""
-        self._work.nominal[:] = commands
+        self.work.nominal[:] = commands
 
     def sample_guide(self, desired: bool) -> None:
         """Whether sample 1 is the commands that stand in `work.guide` at a step, from the next one on."""
         if desired != self._with_guide:
             self._with_guide = self._samplings["with_guide"] = desired
 
-    @property
-    def limits(self) -> Limits:
-        """Limits of commands and of their change in a step."""
-        return self._limits
-
     def guide_is_better(self, below: float) -> bool:
         """Whether the guide costs less than this part of what the plan did, in the last step."""
-        return bool(self._work.costs[1] < below * self._work.costs[0])
+        return bool(self.work.costs[1] < below * self.work.costs[0])
 
     @property
     def guide_cost(self) -> float:
         """Cost of the guide in the last step."""
-        return float(self._work.costs[1])
+        return float(self.work.costs[1])
 
     @property
     def guide_is_valid(self) -> bool:
         """Whether the guide had a cost in the last step."""
-        return bool(self._work.costs[1] < INVALID)
+        return bool(self.work.costs[1] < INVALID)
 
     def use_guide(self) -> None:
         """Continue from the guide."""
-        self._work.nominal[:] = self._work.guide
+        self.work.nominal[:] = self.work.guide
 
     def set_command_history(self, past: Array) -> None:
         """Set the commands before the plan, (history, C)."""
-        blocks = self._work.commands
+        blocks = self.work.commands
         blocks.reshape(len(blocks), -1, int(BLOCK))[:, : past.size] = past.reshape(-1, 1)
 
     def step(
@@ -184,7 +172,7 @@ class Optimiser:
         number = self.step_number
         self.step_number += 1
         self.arguments = (
-            self._work, self._samplings, number, shift_steps, gain, self._basis, self._limits, system, point_weights
+            self.work, self._samplings, number, shift_steps, gain, self._basis, self.limits, system, point_weights
         )  # fmt: skip
         if self._replan is None:
             self._replan = compiled_for(disco_step, *self.arguments)
@@ -194,29 +182,17 @@ class Optimiser:
     @property
     def ess(self) -> float:
         """Effective sample size of the last step."""
-        return float(self._work.report[ESS])
+        return float(self.work.report[ESS])
 
     @property
     def least_cost(self) -> float:
         """Least cost of a sample in the last step; NaN where none was finite."""
-        return float(self._work.report[LEAST])
+        return float(self.work.report[LEAST])
 
     @property
     def nominal_cost(self) -> float:
         """Cost that the plan had before the last step improved it."""
-        return float(self._work.costs[0])
-
-    def report(self) -> dict[str, float]:
-        """Figures of the last step, in order: ess, temperature, cost_min, cost_mean, cost_nominal, valid_samples."""
-        ess, temperature, least, mean, nominal, valid = self._work.report.tolist()
-        return {
-            "ess": ess,
-            "temperature": temperature,
-            "cost_min": least,
-            "cost_mean": mean,
-            "cost_nominal": nominal,
-            "valid_samples": int(valid),
-        }
+        return float(self.work.costs[0])
 
     def sampled_commands(self, limit: int) -> tuple[Array, Array]:
         """Up to `limit` of the last step's samples of the largest weight: commands (n, T, C), weights (n,).
@@ -224,7 +200,7 @@ class Optimiser:
         Worked out again from the noise and the plan that it was added to; changes nothing. None, if the last step was
         not valid.
         """
-        work, samples = self._work, self._sampler.samples
+        work, samples = self.work, self._sampler.samples
         if not self._valid:
             return np.empty((0, *work.nominal.shape)), np.empty(0)
         weights = np.asarray(work.weights[:samples], dtype=np.float64)
@@ -238,15 +214,15 @@ class Optimiser:
 
     def _applied(self, noise: Array) -> Array:
         """Commands (n, T, C) within the limits, from the noise (n, R) of n samples."""
-        horizon, channels = self._work.nominal.shape
+        horizon, channels = self.work.nominal.shape
         first, weights = self._basis
         by_knot = noise[:, : noise.shape[1] // channels * channels].reshape(len(noise), -1, channels)
         if weights is None:
             over_time = by_knot[:, first]
         else:
             over_time = np.einsum("tj,ntjc->ntc", weights, by_knot[:, first[:, None] + np.arange(4)])
-        commands = np.asarray(self._work.before_update + over_time)
-        change, largest = float(self._limits.change), float(self._limits.largest)
+        commands = np.asarray(self.work.before_update + over_time)
+        change, largest = float(self.limits.change), float(self.limits.largest)
         previous = np.broadcast_to(self._before.astype(np.float64), commands[:, 0].shape)
         for t in range(horizon):
             desired = np.minimum(np.maximum(commands[:, t], previous - change), previous + change)

@@ -21,15 +21,16 @@ DELAYED_BY = DELAY.columns[0]
 class DriveMeans:
     """The means of a drive that begins with nothing before it, of commands and of wheel speeds; pure.
 
-    `half_radius_m`: of the wheels, forward speed for each rad/s of their sum.
+    `half_radius_m`: of the wheels, forward speed for each rad/s of their sum. `commands`: the means of both wheels'
+    commands, one pair for each term, up to the last one added; `body`: those of the wheels' speeds, one for each term.
     """
 
     def __init__(
         self, of_commands: tuple[Remembered, ...], of_body: tuple[Remembered, ...], half_radius_m: float
     ) -> None:
-        self._memories, self._body, self._half_radius_m = of_commands, of_body, half_radius_m
-        self._commands = tuple((0.0, 0.0) for _ in of_commands)
-        self._wheels = tuple(0.0 for _ in of_body)
+        self._of_commands, self._of_body, self._half_radius_m = of_commands, of_body, half_radius_m
+        self.commands = tuple((0.0, 0.0) for _ in of_commands)
+        self.body = tuple(0.0 for _ in of_body)
 
     @classmethod
     def of(cls, model: Model) -> DriveMeans | None:
@@ -37,32 +38,22 @@ class DriveMeans:
         memories = memories_of(setting.name for setting in model.effects)
         return cls(*memories, 0.5 * model.wheel_radius_m) if any(memories) else None
 
-    @property
-    def commands(self) -> tuple[tuple[float, float], ...]:
-        """Means of both wheels' commands, one pair for each term, up to the last command added."""
-        return self._commands
-
-    @property
-    def body(self) -> tuple[float, ...]:
-        """Means of the wheels' speeds, one for each term."""
-        return self._wheels
-
     def add_command(self, left_rad_s: float, right_rad_s: float, duration_s: float) -> None:
         """Take in a command that was held for so long."""
-        self._commands = tuple(
+        self.commands = tuple(
             (
                 memory.after(left, memory.of(left_rad_s, right_rad_s), duration_s, 1.0),
                 memory.after(right, memory.of(right_rad_s, left_rad_s), duration_s, 1.0),
             )
-            for memory, (left, right) in zip(self._memories, self._commands, strict=True)
+            for memory, (left, right) in zip(self._of_commands, self.commands, strict=True)
         )
 
     def add_wheels(self, left_rad_s: float, right_rad_s: float, for_s: float) -> None:
         """Take in wheel speeds of so long; what is not finite counts as standing."""
         left, right = (speed if math.isfinite(speed) else 0.0 for speed in (left_rad_s, right_rad_s))
-        self._wheels = tuple(
+        self.body = tuple(
             memory.after(mean, of_wheels(memory, left, right), for_s, self._half_radius_m)
-            for memory, mean in zip(self._body, self._wheels, strict=True)
+            for memory, mean in zip(self._of_body, self.body, strict=True)
         )
 
 

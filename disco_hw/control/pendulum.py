@@ -90,17 +90,12 @@ class PendulumPoints:
 
 
 class PendulumPlanner:
-    """DISCO for the pendulum: torques from angles and speeds, one step of STEP_S at a time."""
+    """DISCO for the pendulum, on an `optimiser`: torques from angles and speeds, one step of STEP_S at a time."""
 
     def __init__(self, points: PendulumPoints, sampler: Sampler = PAPER_SAMPLER, seed: int = 1) -> None:
-        self._optimiser = Optimiser(sampler, 1, points.weights.size, 0, LARGEST_TORQUE_NM, math.inf, seed)
+        self.optimiser = Optimiser(sampler, 1, points.weights.size, 0, LARGEST_TORQUE_NM, math.inf, seed)
         self._begun = False
         self.set_points(points)
-
-    @property
-    def optimiser(self) -> Optimiser:
-        """The sampling optimiser, for its buffers and figures."""
-        return self._optimiser
 
     def set_points(self, points: PendulumPoints) -> None:
         """Plan under these parameter points from now on; their number must not change."""
@@ -120,9 +115,9 @@ class PendulumPlanner:
         # A whole turn more or less changes nothing but the precision of the rollouts.
         self._terms.start[:] = (math.remainder(angle_rad, 2.0 * math.pi), speed_rad_s)
         shift_steps, self._begun = (1.0 if self._begun else 0.0), True
-        if not self._optimiser.step(shift_steps, 1.0, (0.0,), self._terms, self._weights):
+        if not self.optimiser.step(shift_steps, 1.0, (0.0,), self._terms, self._weights):
             raise NoValidControl("no torque sequence has a finite cost; check the state and the parameters")
-        return self._optimiser.nominal()[:, 0]
+        return self.optimiser.nominal()[:, 0]
 
 
 @scalar_function

@@ -113,7 +113,6 @@ class DiscoSettings:
     common_draws: whether the draws of `mc` are shared by all sequences of a step (less noise in their order) or every
     sequence has its own, as in the paper's Algorithm 1.
     ut_alpha: spread of the sigma points; 1 keeps all weights non-negative.
-    latency_s: from the state to when a command made from it acts, beyond the model's command delay.
     gain_by_time: whether a plan moves only the part shift / step_s towards the new optimum when it is made anew within
     a step. Then the plan changes as fast at any rate, and more plans a second average out noise instead of adding it.
     guide_below: where a steering law's commands cost less than this part of the plan, they take its place (tasks with
@@ -136,7 +135,6 @@ class DiscoSettings:
     draws: int = 7
     common_draws: bool = True
     ut_alpha: float = 1.0
-    latency_s: float = 0.0
     gain_by_time: bool = True
     guide_below: float = 0.85
     euler: bool = False
@@ -151,13 +149,12 @@ class DiscoSettings:
         _require(self.step_s > 0.0, "step_s", "above 0")
         _require(self.draws >= 1, "draws", "at least 1")
         _require(self.ut_alpha > 0.0, "ut_alpha", "above 0")
-        _require(self.latency_s >= 0.0, "latency_s", "0 or more")
         _require(self.iterations_at_start >= 1, "iterations_at_start", "at least 1")
         if self.uncertainty == "ut" and self.ut_alpha < 1.0 and self.sampler.risk != "mean":
             raise ValueError("ut_alpha: below 1 the weight of the mean is negative, so only risk 'mean' has a meaning")
 
     @classmethod
-    def paper(cls, uncertainty: Uncertainty = "ut") -> DiscoSettings:
+    def paper(cls) -> DiscoSettings:
         """Return the paper's skid-steer settings (appendix): white noise, control cost, UT with alpha = 0.5.
 
         K = 400, T = 50, temperature 0.1, control authority 0.25 (rotations per second)^2. Rollouts take Euler steps, as
@@ -177,7 +174,6 @@ class DiscoSettings:
         )
         return cls(
             sampler=sampler,
-            uncertainty=uncertainty,
             common_draws=False,
             ut_alpha=0.5,
             gain_by_time=False,

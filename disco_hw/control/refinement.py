@@ -1,7 +1,7 @@
 """Refinement of DISCO's plan beside the task's line: a few Gauss-Newton steps from the better of two plans.
 
 Sampling is the global search and the fallback. Its plan and the last refined one are both costed against a reference
-in time (`kernel/reference.py`, or the task's own), in the mean of the belief; the cheaper one is improved
+in time (`timed_reference`, or the task's own), in the mean of the belief; the cheaper one is improved
 (`kernel/refine.py`). The mean it is because feedback corrects what a wrong parameter does, which a plan costed under
 several points does not know: it leaves the line on the side where their spread costs least.
 """
@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.kernel import START_COS, START_SIN, START_X, START_Y, Terms
-from disco_hw.control.kernel.guide import SteeredChassis
-from disco_hw.control.kernel.reference import timed_reference
+from disco_hw.control.kernel.guide import SteeredChassis, timed_reference
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, refine
 from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.plan import CommandLimits, DiscoSettings

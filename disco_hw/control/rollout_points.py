@@ -24,7 +24,7 @@ from disco_hw.control.past_motion import DELAYED_BY, PastMotion
 from disco_hw.control.plan import Array, CommandLimits, DiscoSettings
 from disco_hw.effects import Channel
 from disco_hw.model import Belief, Model
-from disco_hw.model.model import BASE_PARAMETERS, X_ICR, coefficient_tables
+from disco_hw.model.model import BASE_PARAMETERS, coefficient_tables
 from disco_hw.model.step import FreeRun, integration_series
 
 NARROW_TURN_RAD = 0.4
@@ -38,7 +38,7 @@ class RolloutPoints:
 
     Fixed: `weights` (L,) float32, `history` steps of past commands, and what the fields of `SkidSteer` of the same
     names mean: `each`, `skip_mean`, `series`, `wide`, `euler`. Of the belief in force: the `model`, the mean
-    `mean_theta` (1, P) and its `chassis`, `response_s` (how late the wheels follow), `mean_run` and `run` in steps of
+    `mean_theta` (1, P) and its `chassis`, `mean_run` and `run` in steps of
     the plan under the mean and under each point, the `past` that they remember, and `base`, `effects`, `ahead`,
     `scaled`, `wheels_differ` of `SkidSteer`.
     """
@@ -107,11 +107,10 @@ class RolloutPoints:
         self.mean_run, self.run = FreeRun(model, self.mean_theta, step_s), FreeRun(model, theta, step_s)
         delayed = [f"{s.name}.{s.effect.delayed_by}" for s in model.effects if s.effect.delayed_by is not None]
         dead = [f"{s.name}.{s.effect.dead_by}" for s in model.effects if s.effect.dead_by is not None]
-        self.response_s = sum(_largest(model, self.mean_theta, name) for name in delayed)
+        response_s = sum(_largest(model, self.mean_theta, name) for name in delayed)
         dead_rad_s = sum(_largest(model, self.mean_theta, name) for name in dead)
-        radius_m, axle_m = (_largest(model, self.mean_theta, one.name) for one in BASE_PARAMETERS if one is not X_ICR)
-        x_icr_m = _largest(model, self.mean_theta, X_ICR.name)
-        self.chassis = SteeredChassis(radius_m, axle_m, x_icr_m, float(self.response_s), float(dead_rad_s))
+        radius_m, axle_m, x_icr_m = self.mean_theta[0, : len(BASE_PARAMETERS)].tolist()
+        self.chassis = SteeredChassis(radius_m, axle_m, x_icr_m, float(response_s), float(dead_rad_s))
         self.base, self.effects = coefficient_tables(model, theta, step_s, np.float32)
         found = equivalent_points(model, theta, step_s, self._pairs)
         self.ahead, self.scaled = (_pair(found, number) if number < self._pairs else None for number in (0, 1))

@@ -1,12 +1,24 @@
-"""The sampling update of a plan: sample, roll out, weigh, move; again, or anew, where nothing valid comes out."""
+"""The sampling update of a plan: sample, roll out, weigh, move; again, or anew, where nothing valid comes out.
+
+Beside it the guide along the task's line, as one sample, and as the plan where that stands still. Where nothing is
+found at all: a ramp to zero for a while, then no plan.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+
+import numpy as np
+
 from disco_hw.control.kernel import Floats
+from disco_hw.control.kernel.avoid import TOUCH_COST
+from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
-from disco_hw.control.plan import Diagnostics, DiscoSettings, PlanOutcome
+from disco_hw.control.plan import Array, CommandLimits, Diagnostics, DiscoSettings, NoValidControl, PlanOutcome
 from disco_hw.control.surroundings import Surroundings
+from disco_hw.jit import compiled_for
 
 
 class Sampling:
@@ -57,18 +69,15 @@ class Sampling:
     @property
     def guide_touches(self) -> bool:
         """Whether the guide of the last step touches the fence or an obstacle."""
-        around = self._surroundings
-        return around is not None and self._optimiser.guide_cost >= around.touching_cost
+        return self._surroundings is not None and self._optimiser.guide_cost >= TOUCH_COST
 
     def leave_touching_plan(self) -> None:
         """Continue from the best sample where the plan touches something and that sample does not.
 
         The mean of samples that pass an obstacle on both sides leads through it.
         """
-        around, optimiser = self._surroundings, self._optimiser
-        if around is None or optimiser.least_cost >= around.touching_cost:
-            return
-        if optimiser.nominal_cost >= around.touching_cost:
+        optimiser = self._optimiser
+        if self._surroundings is not None and optimiser.least_cost < TOUCH_COST <= optimiser.nominal_cost:
             commands, _ = optimiser.sampled_commands(1)
             if len(commands):
                 optimiser.set_nominal(commands[0])
@@ -78,3 +87,94 @@ class Sampling:
         ess, temperature, least, mean, nominal, valid = self._optimiser.work.report.tolist()
         collapsed = ess < self._settings.min_ess
         return Diagnostics(ess, temperature, least, mean, nominal, int(valid), retries, collapsed, outcome, speed_part)
+
+
+NEAR_ZERO_SPEED = 0.25
+"""A plan stands that in its first half gets nowhere further away than this part of the way that it is to go."""
+
+
+class Guidance:
+    """Makes the guide (`kernel/guide.py`) of every step, and says when it has the robot."""
+
+    def __init__(self, optimiser: Optimiser, settings: DiscoSettings) -> None:
+        self._optimiser, self._settings = optimiser, settings
+        self._guide: Callable[..., None] | None = None
+        self.until_ns: int | None = None
+        """Until when the guide has the robot, however good the plan is; None if the plan has it."""
+
+    def reset(self) -> None:
+        """Give the robot back to the plan."""
+        self.until_ns = None
+
+    def offer(self, system: SkidSteer, chassis: SteeredChassis, before: tuple[float, float]) -> bool:
+        """Make the guide a sample of the next step; returns whether the task has a line to be guided along."""
+        optimiser = self._optimiser
+        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "way_ahead_m"):
+            optimiser.sample_guide(False)
+            return False
+        optimiser.sample_guide(True)
+        commands, step_s = optimiser.work.guide, self._settings.step_s
+        arguments = commands, system.task, system.start, chassis, *before, optimiser.limits, step_s
+        if self._guide is None:
+            self._guide = compiled_for(guide, *arguments)
+        self._guide(*arguments)
+        return True
+
+    def has_robot(self, now_ns: int, system: SkidSteer, trajectory: Array) -> bool:
+        """Whether the guide has the robot: for a horizon from a plan on that stands, as across the line or far off it.
+
+        Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan.
+        """
+        settings = self._settings
+        horizon_s = settings.sampler.horizon * settings.step_s
+        half = min(settings.sampler.horizon // 2, len(trajectory) - 1)
+        way_m = system.task.way_ahead_m(half * settings.step_s)
+        # From the last place on: that of a plan which does not stand is far enough.
+        begin, *places = trajectory[: half + 1, :2].tolist()
+        if all(math.dist(begin, place) < NEAR_ZERO_SPEED * way_m for place in reversed(places)):
+            self.until_ns = now_ns + round(horizon_s * 1e9)
+        return self.until_ns is not None and now_ns < self.until_ns
+
+
+TRAPPED = (
+    "no way past the fence or an obstacle was found, and the robot stops before it; clear the way, or "
+    "drive it away from there"
+)
+
+
+def ramp_to_zero(start: Array, limits: CommandLimits, step_s: float, steps: int) -> Array:
+    """Return commands (steps, 2) from `start` (2,) to zero (rad/s), as fast as the acceleration limit allows."""
+    change = limits.acceleration_rad_s2 * step_s
+    size = np.maximum(np.abs(start) - np.minimum(change, np.abs(start)) * np.arange(1, steps + 1)[:, None], 0.0)
+    ramp: Array = np.sign(start) * size
+    return ramp
+
+
+class Stopping:
+    """Ramps commands to zero within the limits, for at most `decay_s` on end."""
+
+    def __init__(self, settings: DiscoSettings, limits: CommandLimits) -> None:
+        self._settings, self._limits = settings, limits
+        self._since_ns: int | None = None
+
+    def end(self) -> None:
+        """Note that there is a valid plan again, or none is asked for."""
+        self._since_ns = None
+
+    def ramp(self, now_ns: int, before: tuple[float, float], is_trapped: bool) -> Array:
+        """Commands (T, 2) from those `before` to zero; raises NoValidControl when that has gone on for `decay_s`.
+
+        `is_trapped`: whether it stops because everything in reach touches the fence or an obstacle.
+        """
+        decay_s = self._settings.decay_s
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        if (now_ns - self._since_ns) * 1e-9 >= decay_s:
+            if is_trapped:
+                raise NoValidControl(TRAPPED)
+            raise NoValidControl(
+                f"no command sequence had a finite cost for {decay_s} s, in spite of retries and a "
+                "restart; check the pose, the wheel speeds and the model"
+            )
+        start = np.nan_to_num(np.clip(np.array(before), -self._limits.speed_rad_s, self._limits.speed_rad_s))
+        return ramp_to_zero(start, self._limits, self._settings.step_s, self._settings.sampler.horizon)

@@ -57,7 +57,7 @@ class PlanStart(NamedTuple):
 
 
 class StatePrediction:
-    """Predicts the state over the latency, under the mean parameters and the commands already sent."""
+    """Predicts the state to a plan's start, under the mean parameters and the commands already sent."""
 
     def __init__(
         self, points: RolloutPoints, compensation: DisturbanceCompensation, settings: DiscoSettings,
@@ -97,7 +97,7 @@ class StatePrediction:
         last_left, last_right = last.left_rad_s, last.right_rad_s
         if not self._compensation.is_none:
             last_left, last_right = self._compensation.acting(np.array([[last_left, last_right]]))[0].tolist()
-        slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._points.response_s)
+        slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._points.chassis.response_s)
         return min(max(last_left, left - slack), left + slack), min(max(last_right, right - slack), right + slack)
 
     def commands_before(self, state: PlannerState, end_ns: int, step_s: float, count: int) -> Array:

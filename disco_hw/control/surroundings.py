@@ -25,8 +25,7 @@ from disco_hw.control.kernel.avoid import (
     touches,
 )
 from disco_hw.fence import Footprint
-from disco_hw.fence.clearance import Boundaries
-from disco_hw.fence.outlines import circle_outline
+from disco_hw.fence.clearance import Boundaries, circle_outline
 from disco_hw.jit import compiled_for
 
 Array = NDArray[np.float64]
@@ -56,6 +55,8 @@ class Surroundings:
         self._margin_m = margin_m
         self._deviations = NormalDist().inv_cdf(1.0 - max_breach_probability)
         self._horizon = horizon
+        self.trapped_cost = TOUCH_COST * TRAPPED_PART * horizon / LOOK_EVERY
+        """Cost from which on a sequence touches something for most of the horizon; from TOUCH_COST on it touches."""
         self._table = np.empty((0, COLUMNS))
         self._edges = np.empty((0, COLUMNS))
         self._bounds: Boundaries | None = None
@@ -71,16 +72,6 @@ class Surroundings:
             np.zeros(DETOURS * DETOUR_COLUMNS, np.float32),
             np.zeros(MOST_SHAPES),
         )
-
-    @property
-    def trapped_cost(self) -> float:
-        """Cost from which on a sequence touches something for most of the horizon."""
-        return TOUCH_COST * TRAPPED_PART * self._horizon / LOOK_EVERY
-
-    @property
-    def touching_cost(self) -> float:
-        """Cost from which on a sequence touches something."""
-        return TOUCH_COST
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
         """Keep away from these boundaries; `deviation_m`: of the corner whose place is known least."""

@@ -32,28 +32,21 @@ LONGEST_GAP_S = 0.2
 
 
 class WheelLoss:
-    """Estimated loss of a command (rad/s) at each wheel and in half their difference; negative where they gain."""
+    """Estimated loss of a command (rad/s) at each wheel and in half their difference; negative where they gain.
+
+    `rad_s` (2,): of the left wheel and of the right one; `turn_rad_s`: of half the difference between the two.
+    """
 
     def __init__(self) -> None:
-        self._loss, self._turn = np.zeros(2), 0.0
+        self.rad_s: Array = np.zeros(2)
+        self.turn_rad_s = 0.0
         self._speeds: Wheels | None = None
         self._last_ns = 0
 
     @property
-    def rad_s(self) -> Wheels:
-        """Loss (rad/s) of the left wheel's command and of the right one's."""
-        left, right = self._loss.tolist()
-        return left, right
-
-    @property
-    def turn_rad_s(self) -> float:
-        """Loss (rad/s) of half the difference between the two commands."""
-        return self._turn
-
-    @property
     def is_none(self) -> bool:
         """Whether nothing was lost so far."""
-        return self._turn == 0.0 and not self._loss.any()
+        return self.turn_rad_s == 0.0 and not self.rad_s.any()
 
     def pause(self) -> None:
         """Interrupt the observer while something else moves the robot; what is known of its wheels stays."""
@@ -75,24 +68,24 @@ class WheelLoss:
         # Missing is sign * loss of a wheel, and `turns` * turn more on the right one and less on the left one.
         sides = np.array([last.left_rad_s, last.right_rad_s])
         turns = float(_part(0.5 * (sides[1] - sides[0])))
-        sign = _part(_turned(sides, self._turn, _reduced))
+        sign = _part(_turned(sides, self.turn_rad_s, _reduced))
         share = turns * turns / (1.0 + 2.0 * turns * turns)
         apart = float(missing[1] - missing[0])
         loss_by_wheel = missing + share * apart * _OUTWARDS
         follow = gap_s / FOLLOWED_S
-        self._loss = np.clip(self._loss + follow * sign * loss_by_wheel, -LARGEST_RAD_S, LARGEST_RAD_S)
-        turn = self._turn + follow * turns * float(loss_by_wheel[1] - loss_by_wheel[0])
-        self._turn = min(max(turn, -LARGEST_RAD_S), LARGEST_RAD_S)
+        self.rad_s = np.clip(self.rad_s + follow * sign * loss_by_wheel, -LARGEST_RAD_S, LARGEST_RAD_S)
+        turn = self.turn_rad_s + follow * turns * float(loss_by_wheel[1] - loss_by_wheel[0])
+        self.turn_rad_s = min(max(turn, -LARGEST_RAD_S), LARGEST_RAD_S)
         left, right = (expected - min(gap_s / CORRECTED_S, 1.0) * missing).tolist()
         self._speeds = left, right
 
     def acting(self, commands: Array) -> Array:
         """Commands (N, 2) to a robot that loses nothing and turns as this one does with these."""
-        return _reduced(_turned(commands, self._turn, _reduced), self._loss)
+        return _reduced(_turned(commands, self.turn_rad_s, _reduced), self.rad_s)
 
     def commanded(self, commands: Array) -> Array:
         """Return the inverse of `acting`."""
-        return _turned(_greater(commands, self._loss), self._turn, _greater)
+        return _turned(_greater(commands, self.rad_s), self.turn_rad_s, _greater)
 
 
 _OUTWARDS = np.array([1.0, -1.0])

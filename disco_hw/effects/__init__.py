@@ -190,9 +190,9 @@ class Mimicked:
         return found
 
 
-def no_coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return no coefficients, for effects that move nothing."""
-    return ()
+def parameters_as_they_are(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
+    """Return the parameters themselves, (L,) each: the coefficients of an effect that needs no others."""
+    return tuple(values.T)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,8 +203,8 @@ class Effect:
     is absent; `plain` is the same in float64 numpy, written for reading, with the parameters' `values`, the `geometry`
     (wheel radius, axial distance, x_icr) and the step's length `step_s`. Both ask for what they need by name, see
     `Stage`. `coefficients(values, base, step_s)` works out what `term` needs once for every parameter point: `values`
-    (L, P) in the order of `parameters`, `base` (L, 3) the geometry; arrays of shape (L,). `order` is the place among
-    the effects of a stage, ascending.
+    (L, P) in the order of `parameters`, `base` (L, 3) the geometry; arrays of shape (L,), by default the parameters
+    themselves. `order` is the place among the effects of a stage, ascending.
 
     How it is reported: `sentence` for a report, with `{parameter}` fields, of a time `{parameter_s}` in s or
     `{parameter_ms}` in ms; `sentence_below` in its place where the first parameter is below zero, with its size;
@@ -234,7 +234,7 @@ class Effect:
     excitation: str
     script: str
     term: Callable[..., Any] | None = None
-    coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = no_coefficients
+    coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = parameters_as_they_are
     order: int = 0
     sentence_below: str | None = None
     other_symptoms: tuple[tuple[str, str], ...] = ()

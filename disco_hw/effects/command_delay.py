@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -29,11 +29,6 @@ def term(recent: float, older: float, coefficients: tuple[float, float] | None) 
     return recent + coefficients[1] * (older - recent)
 
 
-def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Return the values from which a fit begins."""
-    return (0.03,), (0.12,), (0.3,), (-0.1,), (-0.3,)
-
-
 EFFECT = Effect(
     name="command_delay",
     channel=Channel.COMMAND_TO_WHEEL,
@@ -45,7 +40,7 @@ EFFECT = Effect(
     term=term,
     delayed_by="delay_s",
     delay_starts=(0.02, 0.1, 0.3, -0.25),
-    starts=starts,
+    starts=lambda _: ((0.03,), (0.12,), (0.3,), (-0.1,), (-0.3,)),
     symptoms=(Symptom.DELAYED_YAW,),
     excitation="steps of the wheel command: start-stops and fast steering",
     script="starts",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects import Channel, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -12,11 +12,6 @@ def plain(command: Value, values: Values) -> Value:
     """Map u to sign(u) max(|u| - width, 0) on each wheel's command."""
     (width,) = values
     return np.sign(command) * np.maximum(np.abs(command) - width, 0.0)
-
-
-def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return the width of the dead band, (L,)."""
-    return (values[:, 0],)
 
 
 @scalar_function
@@ -28,11 +23,6 @@ def term(command: float, coefficients: tuple[float] | None) -> float:
     return command - min(max(command, -width), width)
 
 
-def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Return the value from which a fit begins."""
-    return ((0.2,),)
-
-
 EFFECT = Effect(
     name="deadband",
     channel=Channel.COMMAND_TO_WHEEL,
@@ -40,9 +30,8 @@ EFFECT = Effect(
     order=10,
     parameters=(Parameter("width_rad_s", "rad/s", 0.0, 5.0, 0.3, realistic=0.25),),
     plain=plain,
-    coefficients=coefficients,
     term=term,
-    starts=starts,
+    starts=lambda _: ((0.2,),),
     dead_by="width_rad_s",
     excitation="slow ramps of the wheel command through zero",
     script="ramps",

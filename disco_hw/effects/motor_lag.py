@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import scalar_function
 
 
@@ -33,11 +33,6 @@ def term(end: float, mean: float, speed: float, coefficients: tuple[float, float
     return end + error * left_at_end, end + error * left_in_mean
 
 
-def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
-    """Return the values from which a fit begins."""
-    return (0.05,), (0.25,)
-
-
 EFFECT = Effect(
     name="motor_lag",
     channel=Channel.COMMAND_TO_WHEEL,
@@ -49,7 +44,7 @@ EFFECT = Effect(
     term=term,
     delayed_by="tau_s",
     delay_starts=(0.02, 0.15, 0.4, 0.02),
-    starts=starts,
+    starts=lambda _: ((0.05,), (0.25,)),
     symptoms=(Symptom.DELAYED_YAW,),
     excitation="steps of the wheel command: start-stops and fast steering",
     script="starts",

@@ -19,10 +19,7 @@ EFFECT = Effect(
     channel=Channel.POSE_SENSOR,
     stage=Stage.POSE,
     order=10,
-    parameters=(
-        Parameter("forward_m", "m", -1.0, 1.0, 0.0),
-        Parameter("left_m", "m", -1.0, 1.0, 0.0, realistic=0.015),
-    ),
+    parameters=(Parameter("forward_m", "m", -1.0, 1.0, 0.0), Parameter("left_m", "m", -1.0, 1.0, 0.0, realistic=0.015)),
     plain=plain,
     mimics=Mimicked(lateral_icr, "measure the pose sensor's mount with a ruler, or move the payload and drive again"),
     symptoms=(Symptom.FORWARD_WITH_TURNING,),

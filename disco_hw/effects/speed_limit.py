@@ -16,11 +16,6 @@ def plain(command: Value, values: Values) -> Value:
     return np.clip(command, -limit, limit)
 
 
-def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return the limit of the speed, (L,)."""
-    return (values[:, 0],)
-
-
 @scalar_function
 def term(command: float, coefficients: tuple[float] | None) -> float:
     """Command that is left of a wheel's command (rad/s)."""
@@ -48,7 +43,6 @@ EFFECT = Effect(
     order=30,
     parameters=(Parameter("limit_rad_s", "rad/s", 0.1, 100.0, 6.0, neutral=math.inf),),
     plain=plain,
-    coefficients=coefficients,
     term=term,
     limited=limited,
     starts=starts,

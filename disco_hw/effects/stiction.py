@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Scan, Stage, Value, Values
+from disco_hw.effects import Channel, Effect, Parameter, Scan, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 # Chosen: slower counts as at rest; smaller and a step of the integration may pass over it.
@@ -16,11 +16,6 @@ def plain(command: Value, speed: Value, values: Values) -> Value:
     (threshold,) = values
     resting = (np.abs(speed) < 0.02) | (np.asarray(speed * command) < 0.0)
     return np.where(resting & (np.abs(command) <= threshold), 0.0, command)
-
-
-def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return the threshold of motion, (L,)."""
-    return (values[:, 0],)
 
 
 @scalar_function
@@ -35,11 +30,6 @@ def term(command: float, speed: float, coefficients: tuple[float] | None) -> flo
     return cast_like(0.0, command) if stuck else command
 
 
-def thresholds(driven: CommandedDrive) -> tuple[float, ...]:
-    """Thresholds to try (rad/s)."""
-    return tuple(np.arange(0.1, 2.05, 0.1).tolist())
-
-
 EFFECT = Effect(
     name="stiction",
     channel=Channel.COMMAND_TO_WHEEL,
@@ -47,9 +37,8 @@ EFFECT = Effect(
     order=60,
     parameters=(Parameter("threshold_rad_s", "rad/s", 0.0, 5.0, 0.7, realistic=0.5),),
     plain=plain,
-    coefficients=coefficients,
     term=term,
-    scan=Scan("threshold_rad_s", thresholds, 0.002),
+    scan=Scan("threshold_rad_s", lambda _: tuple(np.arange(0.1, 2.05, 0.1).tolist()), 0.002),
     trials=(0.05, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0),
     excitation="slow ramps of the wheel command from rest",
     script="ramps",

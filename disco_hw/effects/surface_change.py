@@ -6,18 +6,7 @@ import math
 
 import numpy as np
 
-from disco_hw.effects import (
-    Array,
-    Channel,
-    CommandedDrive,
-    Effect,
-    Parameter,
-    Scan,
-    Stage,
-    Symptom,
-    Value,
-    Values,
-)
+from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Scan, Stage, Symptom, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values
+from disco_hw.effects import Channel, Effect, Parameter, Stage, Symptom, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 
@@ -16,11 +16,6 @@ def plain(turn: Value, values: Values) -> Value:
     """
     (share,) = values
     return turn + share * np.abs(turn)
-
-
-def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return the share of the turn, (L,)."""
-    return (values[:, 0],)
 
 
 @scalar_function
@@ -39,7 +34,6 @@ EFFECT = Effect(
     order=125,
     parameters=(Parameter("share", "1", -0.5, 0.5, 0.0, realistic=0.05),),
     plain=plain,
-    coefficients=coefficients,
     term=term,
     may_turn_more=True,
     symptoms=(Symptom.LEFT_UNLIKE_RIGHT,),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.effects import Array, Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
+from disco_hw.effects import Channel, CommandedDrive, Effect, Parameter, Stage, Value, Values
 from disco_hw.jit import cast_like, scalar_function
 
 
@@ -21,11 +21,6 @@ def plain(left: Value, right: Value, values: Values) -> tuple[Value, Value]:
     half = (right - left) / 2.0 + unequal * (left + right) / 2.0
     loss = np.clip(half, -load, load)
     return left + loss, right - loss
-
-
-def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return the load and by how much the wheels are unequal, (L,) each."""
-    return values[:, 0], values[:, 1]
 
 
 @scalar_function
@@ -56,7 +51,6 @@ EFFECT = Effect(
         Parameter("unequal", "1", -0.2, 0.2, 0.0),
     ),
     plain=plain,
-    coefficients=coefficients,
     term=term,
     starts=starts,
     excitation="turning on the spot at two rates, both ways",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from disco_hw.effects import Array, Channel, Effect, Parameter, Stage, Symptom, Value, Values, turning_load
+from disco_hw.effects import Channel, Effect, Parameter, Stage, Symptom, Value, Values, turning_load
 from disco_hw.jit import scalar_function
 
 
@@ -11,11 +11,6 @@ def plain(wheel_sum: Value, difference: Value, values: Values) -> tuple[Value, V
     (ratio,) = values
     left, right = (wheel_sum - difference) / 2.0 * (1.0 - ratio), (wheel_sum + difference) / 2.0 * (1.0 + ratio)
     return left + right, right - left
-
-
-def coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
-    """Return the ratio of the radii, (L,)."""
-    return (values[:, 0],)
 
 
 @scalar_function
@@ -34,7 +29,6 @@ EFFECT = Effect(
     order=110,
     parameters=(Parameter("ratio", "1", -0.5, 0.5, 0.0, realistic=0.008),),
     plain=plain,
-    coefficients=coefficients,
     term=term,
     may_turn_more=True,
     also_seen_as=(turning_load, "unequal"),

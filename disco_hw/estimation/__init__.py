@@ -196,19 +196,9 @@ class PoseFusion:
         if isinstance(outcome, PoseReason):
             outcome = Evaluation(outcome)
         self._counts[f"poses_{outcome.reason.value}"] += 1
-        stds = (sample.position_std_m, sample.yaw_std_rad)
-        self.sources.add_sample(
-            sample.source, sample.t_ns, now_ns, stds, outcome.reason, outcome.innovation, outcome.innovation_variance
-        )
-        return PoseUpdate(
-            t_ns=sample.t_ns,
-            age_s=(now_ns - sample.t_ns) / 1e9,
-            reason=outcome.reason,
-            innovation=outcome.innovation,
-            innovation_variance=outcome.innovation_variance,
-            distance2=outcome.distance2,
-            test_ratio=outcome.test_ratio,
-        )
+        update = PoseUpdate(sample.t_ns, (now_ns - sample.t_ns) / 1e9, *msgspec.structs.astuple(outcome))
+        self.sources.add_sample(sample, update, now_ns)
+        return update
 
     def estimate(self, now_ns: int) -> PoseEstimate:
         """Estimate the pose at `now_ns`.
@@ -297,31 +287,22 @@ class RewindBuffer:
     whatever order it comes in, while its stamp is inside the buffer. A pose between two wheel readings sees the wheels
     at the angles interpolated linearly in time; one beyond the newest reading is judged on extrapolated angles, and
     again when the next reading is there.
-    One call runs each event in the buffer once at worst.
+    One call runs each event in the buffer once at worst. There are never more than `capacity` events;
+    `newest_wheels` is the newest wheel reading.
     """
 
     def __init__(self, pose_filter: PoseFilter, first: WheelReading, history_s: float, sources: int = 1) -> None:
         self._filter = pose_filter
         self._history_ns = round(history_s * 1e9)
         self._max_poses = math.ceil(sources * history_s * MAX_POSE_RATE_HZ)
-        self._max_events = self._max_poses + math.ceil(history_s * MAX_WHEEL_RATE_HZ) + 1
+        self.capacity = self._max_poses + math.ceil(history_s * MAX_WHEEL_RATE_HZ) + 1
         self._poses = 0
         self._events: list[Event] = [first]
         # States after the first len(_states) events; never empty. The rest are outdated and run on demand.
         self._states: list[FilterState] = [pose_filter.begin(first)]
         # The first so many of them are of a filter before the present one, which adopts those that it goes on from.
         self._before = 0
-        self._newest_wheels = first
-
-    @property
-    def newest_wheels(self) -> WheelReading:
-        """The newest wheel reading."""
-        return self._newest_wheels
-
-    @property
-    def capacity(self) -> int:
-        """Number of events that the buffer never exceeds."""
-        return self._max_events
+        self.newest_wheels = first
 
     def __len__(self) -> int:
         return len(self._events)
@@ -338,14 +319,14 @@ class RewindBuffer:
         while isinstance(self._events[index - 1], Measurement):
             index -= 1
         self._outdate(index)
-        self._newest_wheels = reading
+        self.newest_wheels = reading
         self._trim()
 
     def add_pose(self, measurement: Measurement) -> Evaluation | PoseReason:
         """Insert a pose at its stamp; what the filter made of it, or why it cannot be inserted."""
         if measurement.t_ns < self._events[0].t_ns:
             return PoseReason.TOO_OLD
-        if measurement.t_ns > self._newest_wheels.t_ns + self._history_ns:
+        if measurement.t_ns > self.newest_wheels.t_ns + self._history_ns:
             return PoseReason.NO_ODOMETRY
         index = self._index_after(measurement.t_ns, include_equal=True)
         # Of several sources at one instant the lowest is first, in whatever order they come.
@@ -394,8 +375,8 @@ class RewindBuffer:
         state, event = self._state(index - 1), self._events[index]
         if isinstance(event, WheelReading):
             return self._filter.move(state, event.t_ns, event.left_rad, event.right_rad, event.after_gap)
-        if event.t_ns >= self._newest_wheels.t_ns:
-            state = self._filter.extrapolate(state, self._newest_wheels, event.t_ns)
+        if event.t_ns >= self.newest_wheels.t_ns:
+            state = self._filter.extrapolate(state, self.newest_wheels, event.t_ns)
         else:
             ahead = self._wheels_ahead(index)
             part = (event.t_ns - state.t_ns) / (ahead.t_ns - state.t_ns)
@@ -411,8 +392,8 @@ class RewindBuffer:
 
     def _trim(self) -> None:
         """Drop what is too much or older than the buffer, but for the newest such event: the state to start from."""
-        oldest_ns = self._newest_wheels.t_ns - self._history_ns
-        count = max(0, len(self._events) - self._max_events)
+        oldest_ns = self.newest_wheels.t_ns - self._history_ns
+        count = max(0, len(self._events) - self.capacity)
         while count + 1 < len(self._events) and self._events[count + 1].t_ns <= oldest_ns:
             count += 1
         if count:

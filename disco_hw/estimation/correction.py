@@ -13,7 +13,7 @@ import enum
 import importlib
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import ModuleType
 from typing import Any
@@ -39,8 +39,8 @@ from drivers.types import PoseSample
 def deferred(*names: str) -> Iterator[None]:
     """Put off the import of these modules by what the block imports, until something of them is called.
 
-    What the block takes from them by `from NAME import THING` is a stand-in for that function or object. Whoever
-    imports the modules afterwards gets them as ever. Nothing happens to one that is imported already.
+    What the block takes from them by `from NAME import THING` is a stand-in for that function. Whoever imports the
+    modules afterwards gets them as ever. Nothing happens to one that is imported already.
     """
     deferred_modules = {name: _DeferredModule(name) for name in names if name not in sys.modules}
     sys.modules.update(deferred_modules)
@@ -52,29 +52,16 @@ def deferred(*names: str) -> Iterator[None]:
 
 
 class _DeferredModule(ModuleType):
-    """A module as it is seen by an import statement: everything is in it."""
+    """A module as it is seen by an import statement: it has every function, whose call imports the module."""
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("__"):
             raise AttributeError(name)
-        return _DeferredImport(self.__name__, name)
 
+        def call(*arguments: Any, **named: Any) -> Any:
+            return getattr(importlib.import_module(self.__name__), name)(*arguments, **named)
 
-class _DeferredImport:
-    """Placeholder for something of a module, whose use imports the module."""
-
-    def __init__(self, module: str, name: str) -> None:
-        self._source = module, name
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._loaded(), name)
-
-    def __call__(self, *arguments: Any, **named: Any) -> Any:
-        return self._loaded()(*arguments, **named)
-
-    def _loaded(self) -> Any:
-        module, name = self._source
-        return getattr(importlib.import_module(module), name)
+        return call
 
 
 # Above FARTHEST_M, which a place may lie away; a pose beyond these numbers is an error of the sensor.
@@ -166,11 +153,8 @@ def screen(sample: PoseSample) -> Measurement | PoseReason:
 def gate_limit(probability: float, with_heading: bool = True) -> float:
     """Squared Mahalanobis distance that a right pose stays below with this probability.
 
-    Chi-square with three degrees of freedom, with two for a position alone. Raises ValueError for a probability that is
-    not between 0 and 1.
+    Chi-square with three degrees of freedom, with two for a position alone.
     """
-    if not 0.0 < probability < 1.0:
-        raise ValueError(f"a probability between 0 and 1, not {probability}")
     if not with_heading:
         return -2.0 * math.log(1.0 - probability)
     low, high = 0.0, 1500.0

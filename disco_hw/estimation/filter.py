@@ -20,6 +20,7 @@ from disco_hw.estimation.odometry import (
     WheelReading,
     arc,
     belief_at,
+    covariance_by_parameters,
     motion_model,
     predict,
     rebased,
@@ -75,13 +76,8 @@ class HeadingSearch(msgspec.Struct, frozen=True, gc=False):
             xx, xy, xt = xx + w * (b_xx + dx * dx), xy + w * (b_xy + dx * dy), xt + w * (b_xt + dx * dt)
             yy, yt, tt = yy + w * (b_yy + dy * dy), yt + w * (b_yt + dy * dt), tt + w * (b_tt + dt * dt)
         if sensitivity is not None:
-            x0, x1, x2, y0, y1, y2, t0, t1, t2 = sensitivity
-            xx -= x0 * x0 + x1 * x1 + x2 * x2
-            xy -= x0 * y0 + x1 * y1 + x2 * y2
-            xt -= x0 * t0 + x1 * t1 + x2 * t2
-            yy -= y0 * y0 + y1 * y1 + y2 * y2
-            yt -= y0 * t0 + y1 * t1 + y2 * t2
-            tt -= t0 * t0 + t1 * t1 + t2 * t2
+            by_parameters = covariance_by_parameters(sensitivity)
+            xx, xy, xt, yy, yt, tt = (a - b for a, b in zip((xx, xy, xt, yy, yt, tt), by_parameters, strict=True))
         return PoseBelief(x, y, yaw, xx, xy, xt, yy, yt, tt, sensitivity)
 
 
@@ -189,9 +185,7 @@ class PoseFilter:
     def adopt(self, state: FilterState) -> FilterState:
         """Return a state of a filter with other parameters, as one of this filter."""
         return msgspec.structs.replace(
-            state,
-            belief=self._rebased(state.belief),
-            candidate=self._rebased(state.candidate),
+            state, belief=self._rebased(state.belief), candidate=self._rebased(state.candidate)
         )
 
     def move(self, state: FilterState, t_ns: int, left_rad: float, right_rad: float, in_gap: bool) -> FilterState:
@@ -294,20 +288,17 @@ class PoseFilter:
     def _after(
         self, state: FilterState, measurement: Measurement, belief: Belief, evaluation: Evaluation
     ) -> FilterState:
-        return FilterState(
-            state.t_ns,
-            state.left_rad,
-            state.right_rad,
-            belief,
-            None,
-            0,
-            measurement.t_ns,
-            state.reinitialisations + (evaluation.reason is PoseReason.REINITIALISED),
-            evaluation,
-            accepted=(
-                *(each for each in state.accepted if each[0] != measurement.source),
-                (measurement.source, measurement.t_ns),
-            ),
+        others = (each for each in state.accepted if each[0] != measurement.source)
+        return msgspec.structs.replace(
+            state,
+            belief=belief,
+            candidate=None,
+            candidate_count=0,
+            candidate_of=frozenset(),
+            pose_t_ns=measurement.t_ns,
+            reinitialisations=state.reinitialisations + (evaluation.reason is PoseReason.REINITIALISED),
+            evaluation=evaluation,
+            accepted=(*others, (measurement.source, measurement.t_ns)),
         )
 
     def _moved(
@@ -342,18 +333,14 @@ class PoseFilter:
             candidate = (
                 candidate.each(follow) if isinstance(candidate, HeadingSearch) else candidate and follow(candidate)
             )
-        return FilterState(
-            t_ns,
-            left_rad,
-            right_rad,
-            belief,
-            candidate,
-            state.candidate_count,
-            state.pose_t_ns,
-            state.reinitialisations,
-            None,
-            state.candidate_of,
-            state.accepted,
+        return msgspec.structs.replace(
+            state,
+            t_ns=t_ns,
+            left_rad=left_rad,
+            right_rad=right_rad,
+            belief=belief,
+            candidate=candidate,
+            evaluation=None,
         )
 
 

@@ -33,29 +33,13 @@ class OdometryParameters:
 
     The point `x_icr_m` ahead of the tracked point moves as a unicycle (Kozlowski and Pazderski 2004: the tracked point
     slides sideways by v_y = -omega x_icr). `covariance` is that of (wheel_radius_m, axial_distance_m, x_icr_m), 3x3 in
-    SI units, the error being constant over the run; None means exactly known. Raises ValueError on geometry or a
-    covariance that cannot be.
+    SI units, the error being constant over the run; None means exactly known.
     """
 
     wheel_radius_m: float
     axial_distance_m: float
     x_icr_m: float
     covariance: Matrix3 | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("wheel_radius_m", "axial_distance_m"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} = {value} must be finite and positive")
-        if not math.isfinite(self.x_icr_m):
-            raise ValueError(f"x_icr_m = {self.x_icr_m} must be finite")
-        if self.covariance is None:
-            return
-        matrix = np.array(self.covariance, dtype=np.float64)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.array_equal(matrix, matrix.T):
-            raise ValueError("covariance must be a finite symmetric 3x3 matrix")
-        if np.linalg.eigvalsh(matrix)[0] < -1e-12 * float(np.trace(matrix)):
-            raise ValueError("covariance must not have negative eigenvalues")
 
 
 class Arc(msgspec.Struct, frozen=True, gc=False):
@@ -231,6 +215,7 @@ class WheelTracker:
 
 
 Flat9 = tuple[float, float, float, float, float, float, float, float, float]
+_INDEPENDENT: Flat9 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 # A yaw that is anywhere on the circle has this variance; a position is as good as unknown beyond 100 m.
 MAX_YAW_VARIANCE = math.pi**2 / 3.0
@@ -267,14 +252,22 @@ class PoseBelief(msgspec.Struct, frozen=True, gc=False):
         """The whole covariance as nested tuples, symmetric to the bit."""
         xx, xy, xt, yy, yt, tt = self.xx, self.xy, self.xt, self.yy, self.yt, self.tt
         if self.sensitivity is not None:
-            x0, x1, x2, y0, y1, y2, t0, t1, t2 = self.sensitivity
-            xx += x0 * x0 + x1 * x1 + x2 * x2
-            xy += x0 * y0 + x1 * y1 + x2 * y2
-            xt += x0 * t0 + x1 * t1 + x2 * t2
-            yy += y0 * y0 + y1 * y1 + y2 * y2
-            yt += y0 * t0 + y1 * t1 + y2 * t2
-            tt += t0 * t0 + t1 * t1 + t2 * t2
+            by_parameters = covariance_by_parameters(self.sensitivity)
+            xx, xy, xt, yy, yt, tt = (a + b for a, b in zip((xx, xy, xt, yy, yt, tt), by_parameters, strict=True))
         return (xx, xy, xt), (xy, yy, yt), (xt, yt, tt)
+
+
+def covariance_by_parameters(sensitivity: Flat9) -> tuple[float, float, float, float, float, float]:
+    """Return the entries xx, xy, xt, yy, yt, tt of W W'."""
+    x0, x1, x2, y0, y1, y2, t0, t1, t2 = sensitivity
+    return (
+        x0 * x0 + x1 * x1 + x2 * x2,
+        x0 * y0 + x1 * y1 + x2 * y2,
+        x0 * t0 + x1 * t1 + x2 * t2,
+        y0 * y0 + y1 * y1 + y2 * y2,
+        y0 * t0 + y1 * t1 + y2 * t2,
+        t0 * t0 + t1 * t1 + t2 * t2,
+    )
 
 
 class MotionModel(msgspec.Struct, frozen=True, gc=False):
@@ -311,7 +304,7 @@ def motion_model(settings: Estimation, parameters: OdometryParameters) -> Motion
 
 def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: MotionModel) -> PoseBelief:
     """Return a belief with independent x, y (the same variance, m^2) and yaw (rad^2), independent of the parameters."""
-    sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    sensitivity = None if model.parameter_root is None else _INDEPENDENT
     x, y, yaw = pose.x_m, pose.y_m, wrap(pose.yaw_rad)
     return PoseBelief(x, y, yaw, position_variance, 0.0, 0.0, position_variance, 0.0, yaw_variance, sensitivity)
 
@@ -319,7 +312,7 @@ def belief_at(pose: Pose, position_variance: float, yaw_variance: float, model: 
 def rebased(belief: PoseBelief, model: MotionModel) -> PoseBelief:
     """Return the belief under other parameters, whose error is independent of what those before have caused."""
     (xx, xy, xt), (_, yy, yt), (_, _, tt) = belief.covariance
-    sensitivity: Flat9 | None = None if model.parameter_root is None else (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    sensitivity = None if model.parameter_root is None else _INDEPENDENT
     return PoseBelief(belief.x_m, belief.y_m, belief.yaw_rad, xx, xy, xt, yy, yt, tt, sensitivity)
 
 

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
-from disco_hw.estimation.correction import PoseReason, Triple
+from disco_hw.estimation.correction import PoseReason, PoseUpdate, Triple
+from drivers.types import PoseSample
 
 MEAN_WEIGHT = 0.2
 """Of a pose in the running mean of its source's innovations."""
@@ -115,24 +116,22 @@ class PoseSources:
         self._timeout_ns = round(timeout_s * 1e9)
         self._messages: list[str] = []
 
-    def add_sample(
-        self, number: int, t_ns: int, now_ns: int, stds: tuple[float, float], reason: PoseReason,
-        innovation: Triple | None, variance: Triple | None,
-    ) -> None:  # fmt: skip
-        """Take in a pose of a source: stamp, arrival, standard deviations (m, rad) and what the filter made of it."""
-        if not 0 <= number < len(self.all):
+    def add_sample(self, sample: PoseSample, update: PoseUpdate, now_ns: int) -> None:
+        """Take in a pose of a source that came at `now_ns`, and what the filter made of it."""
+        if not 0 <= sample.source < len(self.all):
             return
-        source = self.all[number]
-        age_s = (now_ns - t_ns) * 1e-9
+        source = self.all[sample.source]
+        age_s = (now_ns - sample.t_ns) * 1e-9
         first = not math.isfinite(source.latency_s)
         source.latency_s = age_s if first else source.latency_s + MEAN_WEIGHT * (age_s - source.latency_s)
-        source.came_ns, (source.position_std_m, source.yaw_std_rad) = now_ns, stds
-        if reason is PoseReason.REINITIALISED:
+        source.came_ns = now_ns
+        source.position_std_m, source.yaw_std_rad = sample.position_std_m, sample.yaw_std_rad
+        if update.reason is PoseReason.REINITIALISED:
             for one in self.all:
                 one.reset_course()
-        source.add_evaluation(reason, innovation, variance)
-        if reason.accepted:
-            source.good_ns = max(t_ns, source.good_ns or t_ns)
+        source.add_evaluation(update.reason, update.innovation, update.innovation_variance)
+        if update.accepted:
+            source.good_ns = max(sample.t_ns, source.good_ns or sample.t_ns)
 
     def step(self, now_ns: int) -> None:
         """Judge the sources at the time of a tick; with one alone there is nothing to judge."""
@@ -223,20 +222,13 @@ class PoseSources:
 
 def _difference(one: TrackedSource, other: TrackedSource) -> str:
     """Return by how much two sources differ, where that is more than their noise; else empty."""
-    (x, y, yaw), (xx, yy, tt) = _minus(one.innovation, other.innovation), _plus(one.variance, other.variance)
+    x, y, yaw = (a - b for a, b in zip(one.innovation, other.innovation, strict=True))
+    xx, yy, tt = (a + b for a, b in zip(one.variance, other.variance, strict=True))
     if x * x / xx + y * y / yy > APART_STDS**2:
         return f"{math.hypot(x, y):.2f} m apart,"
     if math.isfinite(yaw) and yaw * yaw / tt > APART_STDS**2:
         return f"{abs(yaw):.2f} rad apart,"
     return ""
-
-
-def _minus(one: Iterable[float], other: Iterable[float]) -> Iterator[float]:
-    return (a - b for a, b in zip(one, other, strict=True))
-
-
-def _plus(one: Iterable[float], other: Iterable[float]) -> Iterator[float]:
-    return (a + b for a, b in zip(one, other, strict=True))
 
 
 def _known(value: float) -> float | None:

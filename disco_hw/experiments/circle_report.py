@@ -16,8 +16,7 @@ from rich.table import Table
 
 from disco_hw.errors import WorkError
 from disco_hw.fence import Circle, Fence, Footprint
-from disco_hw.fence.clearance import Boundaries
-from disco_hw.fence.outlines import circle_outline
+from disco_hw.fence.clearance import Boundaries, circle_outline
 from disco_hw.log.reader import Log, open_log
 from disco_hw.log.records import Counters
 from disco_hw.reports import write_png

@@ -32,7 +32,7 @@ from disco_hw.experiments.fence_drives import (
     wall_drive,
 )
 from disco_hw.fence import Fence
-from disco_hw.fence.outlines import fence_outlines
+from disco_hw.fence.clearance import fence_outlines
 from disco_hw.files import FileKind, read_bytes
 from disco_hw.model import Model
 from disco_hw.reports import write_pictures

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits
-from disco_hw.control.baselines import LAWS, Follower, NominalRobot, Reference
+from disco_hw.control.baselines import LAWS, Follower, Reference
+from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, task_breach
@@ -284,8 +285,8 @@ def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedD
     setup = fenced_setup(Fence(keep_in=around, keep_out=(within,)), task, shipped)
     geometry = (model.wheel_radius_m, model.axial_distance_m, model.x_icr_m)
     limits = CommandLimits.of_robot(setup.config.robot)
-    chassis = NominalRobot(*geometry, plant.speed_loop_time_constant_s, 0.0, limits)
-    law = Follower(Reference(task.course().outline_m(), _WALL_M_S, model.x_icr_m), LAWS["kanayama"](), chassis)
+    chassis = SteeredChassis(*geometry, plant.speed_loop_time_constant_s, 0.0)
+    law = Follower(Reference(task.course().outline_m(), _WALL_M_S, model.x_icr_m), LAWS["kanayama"](), chassis, limits)
     return task_drive(setup, plant, law, seconds, int(rng.integers(1 << 30)), facing_rad=facing)
 
 

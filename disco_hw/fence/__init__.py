@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, NamedTuple, Protocol
+from typing import Annotated, Protocol
 
 import msgspec
 from msgspec import Meta
 
+from disco_hw.errors import FieldFault
 from drivers.samples import FARTHEST_M
 
 Point = tuple[float, float]
@@ -100,29 +101,21 @@ def usual_footprint(robot: WheelGeometry) -> Footprint:
     return Footprint(robot.axial_distance_m + 2.0 * robot.wheel_radius_m, width, robot.x_icr_m)
 
 
-class FenceFault(NamedTuple):
-    """Fault in the section [fence]: the field, the fault, the remedy."""
-
-    field: str
-    fault: str
-    hint: str
-
-
-def fence_fault(fence: Fence, footprint: Footprint) -> FenceFault | None:
+def fence_fault(fence: Fence, footprint: Footprint) -> FieldFault | None:
     """Return the first fault of a fence that no single number shows; None if it is sound."""
     shapes = [("keep_in", fence.keep_in)] if fence.keep_in is not None else []
     shapes += [(f"keep_out[{number}]", shape) for number, shape in enumerate(fence.keep_out)]
     for field, shape in shapes:
         found = _shape_fault(shape)
         if found is not None:
-            return FenceFault(field, *found)
+            return FieldFault(field, *found)
     corners = sum(len(shape) for _, shape in shapes if not isinstance(shape, Circle))
     if corners > MOST_CORNERS:
-        return FenceFault("keep_out", f"{corners} corners in all are too many", f"write at most {MOST_CORNERS}")
+        return FieldFault("keep_out", f"{corners} corners in all are too many", f"write at most {MOST_CORNERS}")
     if fence.keep_in is not None and not _can_hold(fence.keep_in, footprint):
         size = f"{footprint.length:g} m x {footprint.width:g} m"
         fault = f"too small for the robot, whose footprint is {size}"
-        return FenceFault(
+        return FieldFault(
             "keep_in", fault, "write metres in the pose frame (not km or degrees), or correct footprint_m"
         )
     return None

@@ -1,5 +1,7 @@
 """Signed distance from a rectangle at many poses to a fence and to obstacles, and whether a task stays within them.
 
+And the lines that draw a fence, circles and a footprint.
+
 Positive: the whole footprint is inside of `keep_in` and outside of everything else, and so far from the nearest of
 them. Negative: how deep it is where it must not be. The clearance changes by at most as much as a corner moves, as long
 as it is positive.
@@ -13,7 +15,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from disco_hw.fence import Circle, Fence, Footprint, Point, Polygon
 
@@ -22,6 +24,7 @@ FREE_M = 1e6
 """Clearance where there is nothing to keep away from."""
 # Chosen: a longer outline is looked at less closely, rather than for longer.
 _MOST_POSES = 4000
+_ROUND = np.linspace(0.0, 2.0 * np.pi, 49)
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +48,10 @@ class _Outline:
 
 
 class Boundaries:
-    """Boundaries that a footprint must keep away from."""
+    """Boundaries that a footprint must keep away from.
+
+    `circles` (C, 5) to keep out of: x, y, radius, and velocity along x and y.
+    """
 
     def __init__(self, footprint: Footprint, fence: Fence, obstacles: Sequence[MovingCircle] = ()) -> None:
         self.footprint = footprint
@@ -56,19 +62,14 @@ class Boundaries:
         fixed = [shape for shape, inside in shapes if not inside and isinstance(shape, Circle)]
         self._outlines = [_outline(shape, inside) for shape, inside in shapes if not isinstance(shape, Circle)]
         self._fixed = [MovingCircle(*circle.center, circle.radius_m) for circle in fixed]
-        self._circles = _table(self._fixed)
+        self.circles = _table(self._fixed)
         self._half = np.array([0.5 * footprint.length, 0.5 * footprint.width])
         self._corners = np.array(footprint.corners_m()) - [footprint.ahead, 0.0]
         self.set_obstacles(obstacles)
 
     def set_obstacles(self, obstacles: Sequence[MovingCircle]) -> None:
         """Keep away from these circles too, in place of those before."""
-        self._circles = _table([*self._fixed, *obstacles])
-
-    @property
-    def circles(self) -> Array:
-        """Circles to keep out of (C, 5): x, y, radius, and velocity along x and y."""
-        return self._circles
+        self.circles = _table([*self._fixed, *obstacles])
 
     @property
     def polygons(self) -> list[tuple[Array, bool]]:
@@ -99,7 +100,7 @@ class Boundaries:
             corners = self._world_corners(centers, cos, sin)
             off = np.hypot(corners[..., 0] - circle.center[0], corners[..., 1] - circle.center[1])
             columns.append(circle.radius_m - off.max(axis=1, keepdims=True))
-        if len(self._circles):
+        if len(self.circles):
             columns.append(self._from_circles(centers, cos, sin, times_s))
         for outline in self._outlines:
             columns.append(self._from_polygon(outline, centers, cos, sin, farthest)[:, None])
@@ -117,7 +118,7 @@ class Boundaries:
 
     def _from_circles(self, centers: Array, cos: Array, sin: Array, times_s: Array | None) -> Array:
         """Clearance (N, C) to the circles to keep out of."""
-        x, y, radius, vx, vy = self._circles.T
+        x, y, radius, vx, vy = self.circles.T
         at_s = np.zeros(len(centers)) if times_s is None else times_s
         dx = x + vx * at_s[:, None] - centers[:, :1]
         dy = y + vy * at_s[:, None] - centers[:, 1:]
@@ -254,3 +255,29 @@ def task_breach(fence: Fence, footprint: Footprint, course: TaskLine) -> str | N
         (x, y), far = crossing
         return f"the task's line crosses it near ({x:.2f}, {y:.2f}): the footprint is {far:.2f} m outside there"
     return None
+
+
+def fence_outlines(fence: Fence) -> list[Array]:
+    """Return the fence's shapes as closed lines (N, 2)."""
+    shapes = [*(() if fence.keep_in is None else (fence.keep_in,)), *fence.keep_out]
+    return [
+        circle_outline(*shape.center, shape.radius_m) if isinstance(shape, Circle) else _closed(shape)
+        for shape in shapes
+    ]
+
+
+def footprint_outline(footprint: Footprint, pose: tuple[float, float, float]) -> Array:
+    """Return the footprint at a pose of the tracked point as a closed line (5, 2)."""
+    x_m, y_m, yaw_rad = pose
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    return _closed([(x_m + cos * x - sin * y, y_m + sin * x + cos * y) for x, y in footprint.corners_m()])
+
+
+def circle_outline(x_m: float, y_m: float, radius_m: float) -> Array:
+    """Return a circle as a closed line (N, 2)."""
+    return np.stack((x_m + radius_m * np.cos(_ROUND), y_m + radius_m * np.sin(_ROUND)), axis=1)
+
+
+def _closed(points: ArrayLike) -> Array:
+    found = np.asarray(points, dtype=np.float64)
+    return np.concatenate((found, found[:1]))

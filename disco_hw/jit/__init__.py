@@ -87,6 +87,11 @@ def specialise(function: Callable[..., Any]) -> Callable[..., Any]:
     return decorator
 
 
+def compiled_only(argument: object) -> TypeError:
+    """Return the error of a function that has compiled forms alone, and none for an argument of this type."""
+    return TypeError(f"{type(argument).__name__}: no compiled form takes it, and Python cannot call this function")
+
+
 @cache
 def sources_fingerprint() -> str:
     """Hash of all Python sources that compiled code can come from."""
@@ -139,7 +144,7 @@ def tune_loops(_context: Context) -> tuple[Any, Callable[..., Any]]:
     """Let the loops of the calling function use the processor's widest vectors and its estimates of reciprocal roots.
 
     Without estimates a sampled plan takes 15 % longer, with the loops in their callers 13 %, with checks for overlap
-    4 %; without wide vectors as long, on an AMD processor (`python -m tools.bench.jit_tricks`).
+    4 %; without wide vectors as long, on an AMD processor (docs/results.md).
 
     LLVM holds back to 256 bits on processors whose early kinds slowed down for 512; here every loop is long enough to
     gain. ARM's have one width, which is used anyway. The arrays that the function is handed must not overlap: no loop

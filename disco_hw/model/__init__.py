@@ -189,8 +189,6 @@ def model_text(model: Model) -> str:
                 lines += ["]"]
             case Uniform():
                 lines += ['kind = "uniform"', names, *_vector("low", belief.low), *_vector("high", belief.high)]
-            case _:
-                raise TypeError(f"a belief of type {type(belief).__name__} has no form in a model file")
     return "\n".join(lines) + "\n"
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-from disco_hw.jit import cast_like, scalar_function, specialise
+from disco_hw.jit import cast_like, compiled_only, scalar_function, specialise
 from disco_hw.model.coefficients import Base, Coefficients, TermCoefficients, Terms
 from disco_hw.model.terms import BODY_FEATURES, COMMAND, COMMAND_FEATURES, TERMS, Feature, GenericTerm
 
@@ -86,25 +86,11 @@ def new_means(effects: Coefficients) -> NDArray[np.float64] | None:
 def add_to_commands(
     left: float, right: float, time_s: float, terms: Terms | None, means: Means, at: Any, apart: Any
 ) -> tuple[float, float]:
-    """Return both commands (rad/s) with the terms that act on them.
+    """Return both commands (rad/s) with the terms that act on them; compiled code only.
 
     Number n of the means that terms remember is `means[at + n * apart]`, and goes on by a step.
     """
-    if terms is None:
-        return left, right
-    new_left, new_right, place = left, right, 0
-    for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
-        if term.memory is None:
-            feature = COMMAND_FEATURES[term.feature]
-            new_left = new_left + entry.k * _within(feature(left, right, time_s), entry.reach)
-            new_right = new_right + entry.k * _within(feature(right, left, time_s), entry.reach)
-            continue
-        mean_left = _averaged(term.memory.of(left, right), entry, means, at + place * apart)
-        mean_right = _averaged(term.memory.of(right, left), entry, means, at + (place + 1) * apart)
-        new_left = new_left + entry.k * _within(term.memory.feature(left, right, mean_left), entry.reach)
-        new_right = new_right + entry.k * _within(term.memory.feature(right, left, mean_right), entry.reach)
-        place += term.means
-    return new_left, new_right
+    raise compiled_only(terms)
 
 
 @scalar_function
@@ -139,7 +125,7 @@ def _add_to_commands(
 ) -> Callable[..., Any]:
     arguments = "left, right, time_s, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
-        return _made("add_to_commands", arguments, ["return left, right"], {})
+        return written_out("add_to_commands", arguments, ["return left, right"], {})
     scope: dict[str, Any] = {"averaged": _averaged, "within": _within, "place": np.uintp}
     lines, place = ["new_left, new_right = left, right"], 0
     for n, term in enumerate(_compiled_terms(terms)):
@@ -158,7 +144,7 @@ def _add_to_commands(
             f"new_right = new_right + terms[{n}].k * within(feature{n}(right, left, mean_right), terms[{n}].reach)",
         ]
         place += term.means
-    return _made("add_to_commands", arguments, [*lines, "return new_left, new_right"], scope)
+    return written_out("add_to_commands", arguments, [*lines, "return new_left, new_right"], scope)
 
 
 @scalar_function
@@ -174,33 +160,9 @@ def add_to_velocity(
 ) -> tuple[float, float | None, float]:  # fmt: skip
     """Return forward and lateral speed (m/s) and half the yaw rate (rad/s) with the terms that act on them.
 
-    Wheels as for `body_velocity`, means as for `add_to_commands`.
+    Wheels as for `body_velocity`, means as for `add_to_commands`. Compiled code only.
     """
-    if terms is None:
-        return forward, lateral, turn
-    ratio = 2.0 * base.half_turn_ratio
-    v, w, place = base.half_radius_m * wheel_sum, ratio * difference, 0
-    for entry, term in zip(terms, _terms_of(map(type, terms)), strict=True):
-        if term.memory is None:
-            feature = BODY_FEATURES[term.feature](v, w, base.half_radius_m * change * entry.per_s, time_s)
-        else:
-            unit = term.memory.of(base.half_radius_m, ratio)
-            signal, here = term.memory.of(wheel_sum, difference), at + place * apart
-            if term.memory.slews:
-                followed = unit * _slewed(signal, entry.most / unit, means, here)
-            else:
-                followed = unit * _averaged(signal, entry, means, here)
-            feature = term.memory.feature(v, w, followed)
-            place += term.means
-        more = entry.k * _within(feature, entry.reach)
-        match term.target:
-            case "v_x":
-                forward = forward + more
-            case "v_y":
-                lateral = more if lateral is None else lateral + more
-            case _:
-                turn = turn + 0.5 * more
-    return forward, lateral, turn
+    raise compiled_only(terms)
 
 
 @specialise(add_to_velocity)
@@ -210,7 +172,7 @@ def _add_to_velocity(
 ) -> Callable[..., Any]:  # fmt: skip
     arguments = "forward, lateral, turn, wheel_sum, difference, change, time_s, base, terms, means, at, apart"
     if isinstance(terms, types.NoneType):
-        return _made("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
+        return written_out("add_to_velocity", arguments, ["return forward, lateral, turn"], {})
     scope: dict[str, Any] = {
         "plus": _plus, "cast_like": cast_like, "averaged": _averaged, "slewed": _slewed, "within": _within,
         "place": np.uintp,
@@ -245,12 +207,12 @@ def _add_to_velocity(
                 across += 1
             case _:
                 lines.append(f"new_turn = new_turn + cast_like(0.5, turn) * ({more})")
-    return _made("add_to_velocity", arguments, [*lines, f"return new_forward, lateral{across}, new_turn"], scope)
+    return written_out("add_to_velocity", arguments, [*lines, f"return new_forward, lateral{across}, new_turn"], scope)
 
 
 def terms_need_change(terms: Terms | None) -> bool:
-    """Whether any of the body's terms depends on the acceleration; a constant to the compiler."""
-    return terms is not None and any(TERMS[_NAME_OF[type(term)]].needs_acceleration for term in terms)
+    """Whether any of the body's terms depends on the acceleration; a constant of compiled code."""
+    raise compiled_only(terms)
 
 
 @specialise(terms_need_change)
@@ -260,8 +222,8 @@ def _terms_need_change(terms: Any) -> Callable[..., Any]:
     return lambda terms: False
 
 
-def _made(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
-    """Return a function of these lines; a tuple of mixed types cannot be looped over in compiled code."""
+def written_out(name: str, arguments: str, lines: list[str], scope: dict[str, Any]) -> Callable[..., Any]:
+    """Return a function of these lines, which compiled code calls: it cannot loop over a tuple of mixed types."""
     body = "\n".join(f"    {line}" for line in lines)
     exec(f"def {name}({arguments}):\n{body}", scope)
     made: Callable[..., Any] = scope[name]

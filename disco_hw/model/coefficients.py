@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import msgspec
@@ -16,7 +16,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from disco_hw.effects.registry import MOTION_EFFECTS
-from disco_hw.jit import scalar_function, specialise
+from disco_hw.jit import compiled_only, scalar_function, specialise
 
 
 class Base(NamedTuple):
@@ -28,37 +28,19 @@ class Base(NamedTuple):
 
 
 class TermCoefficients(Protocol):
-    """Coefficients of a term without a name, of one parameter point or arrays (L,) of many.
+    """Coefficients of a term without a name, of one parameter point or arrays (L,) of many; it has some of these.
 
-    k, reach and, of a term that remembers, how its memory follows in a step, else the steps a second.
+    `k`: factor of the feature, which stays within `reach`. `per_s`: steps in a second. Of a term that remembers
+    `by_end`, `over_step`: the share of the way to its signal that the mean has gone by the end of a step, and averaged
+    over it; or `most`: the largest step (m/s) of what follows at a limited rate.
     """
 
-    @property
-    def k(self) -> Any:
-        """Factor of the term, by which its feature is multiplied."""
-
-    @property
-    def reach(self) -> Any:
-        """The size at which its feature stays."""
-
-    @property
-    def per_s(self) -> Any:
-        """Number of steps in a second."""
-
-    @property
-    def by_end(self) -> Any:
-        """Share of the way to its signal that the mean has gone by the end of a step."""
-
-    @property
-    def over_step(self) -> Any:
-        """Share of the way to its signal that the mean has gone, averaged over a step."""
-
-    @property
-    def most(self) -> Any:
-        """Largest step (m/s) of what follows at a limited rate."""
-
-    def __iter__(self) -> Iterator[Any]:
-        """Iterate over the coefficients that the term has, in the order of its type."""
+    k: Any
+    reach: Any
+    per_s: Any
+    by_end: Any
+    over_step: Any
+    most: Any
 
 
 Terms = tuple[TermCoefficients, ...]
@@ -71,13 +53,8 @@ class Coefficients(Protocol):
     and one each for the terms without a name that act on commands and on the body.
     """
 
-    @property
-    def command_terms(self) -> Terms | None:
-        """Terms that act on commands."""
-
-    @property
-    def body_terms(self) -> Terms | None:
-        """Terms that act on the body."""
+    command_terms: Terms | None
+    body_terms: Terms | None
 
 
 _effects_type: Any = namedtuple
@@ -112,8 +89,8 @@ def base_point(base: Base, i: int) -> Base:
 
 
 def entry(table: tuple[NDArray[np.floating], ...] | None, i: int) -> tuple[float, ...] | None:
-    """Coefficients of one effect at point i: a tuple of numbers, or None where the effect is absent."""
-    return None if table is None else tuple(column[i] for column in table)
+    """Coefficients of one effect at point i, numbers, or None where it is absent; compiled code only."""
+    raise compiled_only(table)
 
 
 # What is overloaded is chosen by numba's types; those of tuples have fields that its annotations do not know.
@@ -128,11 +105,8 @@ def _entry(table: Any, i: types.Type) -> Callable[..., Any] | None:
 
 
 def terms_point(terms: Terms | None, i: int) -> Terms | None:
-    """Coefficients of all terms without a name at point i; None if there are none."""
-    if terms is None:
-        return None
-    kinds: list[Any] = [type(term) for term in terms]
-    return tuple(kind(*(column[i] for column in term)) for kind, term in zip(kinds, terms, strict=True))
+    """Coefficients of all terms without a name at point i, None if there are none; compiled code only."""
+    raise compiled_only(terms)
 
 
 @specialise(terms_point)
@@ -150,10 +124,8 @@ def _terms_point(terms: Any, i: types.Type) -> Callable[..., Any]:
 
 
 def effect_point(effects: Coefficients, i: int) -> Coefficients:
-    """Coefficients of all effects at point i."""
-    named = (entry(getattr(effects, name), i) for name in MOTION_EFFECTS)
-    made: Coefficients = Effects(*named, terms_point(effects.command_terms, i), terms_point(effects.body_terms, i))
-    return made
+    """Coefficients of all effects at point i; compiled code only."""
+    raise compiled_only(effects)
 
 
 @specialise(effect_point)
@@ -168,9 +140,11 @@ def _effect_point(effects: types.Type, i: types.Type) -> Callable[..., Any]:
 
 
 def lane_base(base: Base, i: int) -> Base:
-    """Return base coefficients of a sample: the point itself, or entry i of a table with a point for every sample."""
-    point: Base = base_point(base, i)
-    return point
+    """Return base coefficients of a sample: the point itself, or entry i of a table with a point for every sample.
+
+    Compiled code only.
+    """
+    raise compiled_only(base)
 
 
 @specialise(lane_base)
@@ -192,8 +166,8 @@ def _first_number(kind: types.Type) -> types.Type:
 
 
 def lane_effects(effects: Coefficients, i: int) -> Coefficients:
-    """Coefficients of all effects for a sample: the point itself, or entry i of a table."""
-    return effect_point(effects, i)
+    """Coefficients of all effects for a sample: the point itself, or entry i of a table; compiled code only."""
+    raise compiled_only(effects)
 
 
 @specialise(lane_effects)

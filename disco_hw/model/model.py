@@ -9,7 +9,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,23 +22,6 @@ from disco_hw.model.coefficients import Base, Coefficients, Effects, TermCoeffic
 from disco_hw.model.terms import COMMAND, REACH, TERMS, effect_of
 
 Array = NDArray[np.float64]
-
-
-class Belief(Protocol):
-    """A joint distribution over the named parameters; P is their number."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The parameters, in the order of all arrays."""
-
-    def mean(self) -> Array:
-        """Mean vector, shape (P,)."""
-
-    def covariance(self) -> Array:
-        """Covariance matrix, shape (P, P)."""
-
-    def draw(self, count: int, rng: np.random.Generator) -> Array:
-        """Independent draws, shape (count, P)."""
 
 
 def _checked_covariance(covariance: Array, size: int, what: str) -> Array:
@@ -184,6 +166,9 @@ class Uniform:
         """Independent draws, shape (count, P)."""
         return np.asarray(rng.uniform(self.low, self.high, (count, len(self.names))))
 
+
+Belief = Gaussian | Mixture | Uniform
+"""A joint distribution over the parameters `names`, in the order of all arrays; P is their number."""
 
 WHEEL_RADIUS = Parameter("wheel_radius_m", "m", 0.005, 2.0, 0.06, neutral=0.06)
 AXIAL_DISTANCE = Parameter("axial_distance_m", "m", 0.02, 5.0, 0.4, neutral=0.4)

@@ -2,13 +2,13 @@
 
 Everything broadcasts: a value of theta, a state or a command may be a number or an array. `theta` maps the full names
 of parameters ("wheel_radius_m", then `effect.parameter`) to values; an effect acts if its parameters are there. What an
-effect does is `plain` in its own file; here is what all robots have in common, and the order.
+effect does is `plain` in its own file, what a term's feature is in `terms`; here is what all robots have in common, and
+the order.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,15 @@ import numpy as np
 
 from disco_hw.effects import Array, Effect, Stage, Value, Values, arguments_of
 from disco_hw.effects.registry import DELAY, in_stages
+from disco_hw.model.terms import (
+    BODY_FEATURES,
+    BODY_MEMORIES,
+    BODY_TARGETS,
+    COMMAND,
+    COMMAND_FEATURES,
+    COMMAND_MEMORIES,
+    Remembered,
+)
 
 Theta = Mapping[str, Value]
 Means = Mapping[str, tuple[Value, ...]]
@@ -51,128 +60,24 @@ def delayed(commands: Array, history: int, theta: Theta, step_s: float) -> Array
     return np.asarray((1.0 - fraction) * commands[recent] + fraction * commands[older])
 
 
-def _sign(x: Value, rest: float) -> Value:
-    """Return the sign of x, faded out below `rest`."""
-    return np.sign(x) * x**2 / (x**2 + rest**2)
+def _over(memory: Remembered, before: Value, value: Value, step_s: float) -> Value:
+    """Return the mean of a memory over a step, at whose start it was `before`, under a constant input."""
+    if memory.slews:
+        most = memory.most * step_s
+        way: Value = np.clip(value - before, -most, most)
+        # On its way, and there for the rest.
+        return before + way * (1.0 - 0.5 * np.abs(way) / most)
+    _, over_step = memory.follows(step_s)
+    return before + over_step * (value - before)
 
 
-# The features of terms without a name, as `disco_hw.model.terms` has them.
-COMMAND_FEATURES: Mapping[str, Callable[[Value, Value, float], Value]] = {
-    "u |u|": lambda u, other, t: np.sign(u) * u**2,
-    "u^3": lambda u, other, t: u**3,
-    "sign(u)": lambda u, other, t: _sign(u, 0.05),
-    "|u|": lambda u, other, t: np.abs(u),
-    "u^2": lambda u, other, t: u**2,
-    "|u_other| sign(u)": lambda u, other, t: np.abs(other) * _sign(u, 0.05),
-    "u_other": lambda u, other, t: other,
-    "u_other |u|": lambda u, other, t: other * np.abs(u),
-    "|u_other| u": lambda u, other, t: np.abs(other) * u,
-    "u_other^2 sign(u)": lambda u, other, t: other**2 * _sign(u, 0.05),
-    "|u - u_other| sign(u)": lambda u, other, t: np.abs(u - other) * _sign(u, 0.05),
-    "u / (1 + |u|)": lambda u, other, t: u / (1.0 + np.abs(u)),
-    "t/100 u": lambda u, other, t: t / 100.0 * u,
-    "t/100 sign(u)": lambda u, other, t: t / 100.0 * _sign(u, 0.05),
-}
-BODY_FEATURES: Mapping[str, Callable[[Value, Value, Value, float], Value]] = {
-    "v": lambda v, w, a, t: v,
-    "|v|": lambda v, w, a, t: np.abs(v),
-    "v |v|": lambda v, w, a, t: np.sign(v) * v**2,
-    "v^2": lambda v, w, a, t: v**2,
-    "v^3": lambda v, w, a, t: v**3,
-    "omega": lambda v, w, a, t: w,
-    "|omega|": lambda v, w, a, t: np.abs(w),
-    "omega |omega|": lambda v, w, a, t: np.sign(w) * w**2,
-    "omega^2": lambda v, w, a, t: w**2,
-    "omega^3": lambda v, w, a, t: w**3,
-    "sign(omega)": lambda v, w, a, t: _sign(w, 0.05),
-    "sign(v)": lambda v, w, a, t: _sign(v, 0.02),
-    "omega / (2 + 5 |omega|)": lambda v, w, a, t: w / (2.0 + 5.0 * np.abs(w)),
-    "v omega": lambda v, w, a, t: v * w,
-    "v |omega|": lambda v, w, a, t: v * np.abs(w),
-    "|v| omega": lambda v, w, a, t: np.abs(v) * w,
-    "v^2 omega": lambda v, w, a, t: v**2 * w,
-    "v omega^2": lambda v, w, a, t: v * w**2,
-    "a": lambda v, w, a, t: a,
-    "|v| a": lambda v, w, a, t: np.abs(v) * a,
-    "v |a|": lambda v, w, a, t: v * np.abs(a),
-    "omega a": lambda v, w, a, t: w * a,
-    "t/100 v": lambda v, w, a, t: t / 100.0 * v,
-    "t/100 omega": lambda v, w, a, t: t / 100.0 * w,
-}
-
-
-@dataclass(frozen=True)
-class _Memory:
-    """A lag (s), what goes into it, and the feature of the motion and what comes out, in the mean over a step."""
-
-    time_s: float
-    goes_in: Callable[..., Value]
-    feature: Callable[..., Value]
-
-    def over(self, before: Value, value: Value, step_s: float) -> Value:
-        """Mean of what comes out over a step, at whose start it was `before`, while `value` goes in."""
-        lag = self.time_s / step_s
-        return value + (before - value) * lag * (1.0 - math.exp(-1.0 / lag))
-
-    def after(self, before: Value, value: Value, step_s: float) -> Value:
-        """Return the memory at the end of a step at whose start it was `before`, under a constant input."""
-        return value + (before - value) * math.exp(-step_s / self.time_s)
-
-
-@dataclass(frozen=True)
-class _Slewed:
-    """Memory that follows its input by at most `most` a second (m/s^2), with the feature that uses it."""
-
-    most: float
-    goes_in: Callable[..., Value]
-    feature: Callable[..., Value]
-
-    def over(self, before: Value, value: Value, step_s: float) -> Value:
-        """Mean of what comes out over a step, at whose start it was `before`: on its way, and there for the rest."""
-        way = value - before
-        arrives = np.minimum(np.abs(way) / (self.most * step_s), 1.0)
-        end = self.after(before, value, step_s)
-        return 0.5 * (before + end) * arrives + end * (1.0 - arrives)
-
-    def after(self, before: Value, value: Value, step_s: float) -> Value:
-        """Return the memory at the end of a step at whose start it was `before`, under a constant input."""
-        return np.clip(value, before - self.most * step_s, before + self.most * step_s)
-
-
-_Remembering = _Memory | _Slewed
-
-_SHORT_TO_LONG = {"0.3": 0.3, "1": 1.0, "3": 3.0}
-COMMAND_MEMORIES: Mapping[str, _Remembering] = {
-    **{
-        f"u mean_{name}s(|u| + |u_other|)": _Memory(
-            time_s, lambda u, other: np.abs(u) + np.abs(other), lambda u, other, mean: mean * u
-        )
-        for name, time_s in _SHORT_TO_LONG.items()
-    },
-    **{
-        f"(u - mean_{name}s(u))": _Memory(time_s, lambda u, other: u, lambda u, other, mean: u - mean)
-        for name, time_s in (("0.3", 0.3), ("1", 1.0))
-    },
-    "u mean_30s(u^2)": _Memory(30.0, lambda u, other: u**2, lambda u, other, mean: mean * u),
-    **{
-        f"sign(u - mean_{name}s(u))": _Memory(time_s, lambda u, other: u, lambda u, other, mean: _sign(u - mean, 0.1))
-        for name, time_s in _SHORT_TO_LONG.items()
-    },
-}
-BODY_MEMORIES: Mapping[str, _Remembering] = {
-    **{
-        f"(v - mean_{name}s(v))": _Memory(time_s, lambda v, w: v, lambda v, w, mean: v - mean)
-        for name, time_s in _SHORT_TO_LONG.items()
-    },
-    **{
-        f"(omega - mean_{name}s(omega))": _Memory(time_s, lambda v, w: w, lambda v, w, mean: w - mean)
-        for name, time_s in _SHORT_TO_LONG.items()
-    },
-    **{
-        f"(v - slewed_{most}(v))": _Slewed(float(most), lambda v, w: v, lambda v, w, slewed: v - slewed)
-        for most in ("1", "1.25", "1.6", "2", "2.5", "3.2", "4", "5", "6.3", "8")
-    },
-}
+def _after(memory: Remembered, before: Value, value: Value, step_s: float) -> Value:
+    """Return a memory at the end of a step at whose start it was `before`, under a constant input."""
+    if memory.slews:
+        slewed: Value = np.clip(value, before - memory.most * step_s, before + memory.most * step_s)
+        return slewed
+    by_end, _ = memory.follows(step_s)
+    return before + by_end * (value - before)
 
 
 def _terms(theta: Theta, target: str) -> list[tuple[str, Value, Value]]:
@@ -181,17 +86,17 @@ def _terms(theta: Theta, target: str) -> list[tuple[str, Value, Value]]:
     return [(name.partition(" += k ")[2], theta[f"{name}.k"], theta[f"{name}.reach"]) for name in names]
 
 
-def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
+def _commands_remembered(theta: Theta, left: Value, right: Value) -> dict[str, tuple[Remembered, tuple[Value, ...]]]:
     """Return, by feature, the memories of commands that act, and what goes into each of their means."""
-    acting = [(name, COMMAND_MEMORIES[name]) for name, *_ in _terms(theta, "command") if name in COMMAND_MEMORIES]
-    return {name: (memory, (memory.goes_in(left, right), memory.goes_in(right, left))) for name, memory in acting}
+    acting = [(name, COMMAND_MEMORIES[name]) for name, *_ in _terms(theta, COMMAND) if name in COMMAND_MEMORIES]
+    return {name: (memory, (memory.of(left, right), memory.of(right, left))) for name, memory in acting}
 
 
-def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[_Remembering, tuple[Value, ...]]]:
+def _body_remembered(theta: Theta, v: Value, w: Value) -> dict[str, tuple[Remembered, tuple[Value, ...]]]:
     """Return the memories of the body's terms and their inputs, which are forward speed and yaw rate."""
-    features = [name for target in ("v_x", "omega") for name, *_ in _terms(theta, target)]
-    acting = [(name, BODY_MEMORIES[name]) for name in features if name in BODY_MEMORIES]
-    return {name: (memory, (memory.goes_in(v, w),)) for name, memory in acting}
+    acting = {name for target in BODY_TARGETS for name, *_ in _terms(theta, target)}
+    memories = {name: memory for of_target in BODY_MEMORIES.values() for name, memory in of_target.items()}
+    return {name: (memory, (memory.of(v, w),)) for name, memory in memories.items() if name in acting}
 
 
 def _ideal(theta: Theta, left: Value, right: Value) -> tuple[Value, Value]:
@@ -229,11 +134,11 @@ def wheel_targets(
     """Wheel speeds that the drive aims for (rad/s), from commands and the wheel speeds of the state."""
     u_left, u_right = left, right
     remembered = _commands_remembered(theta, left, right)
-    for feature, k, reach in _terms(theta, "command"):
+    for feature, k, reach in _terms(theta, COMMAND):
         if feature in remembered:
             memory, values = remembered[feature]
             before = state.means.get(feature, (0.0, 0.0))
-            of_left, of_right = (memory.over(*pair, step_s) for pair in zip(before, values, strict=True))
+            of_left, of_right = (_over(memory, *pair, step_s) for pair in zip(before, values, strict=True))
             left = left + k * np.clip(memory.feature(u_left, u_right, of_left), -reach, reach)
             right = right + k * np.clip(memory.feature(u_right, u_left, of_right), -reach, reach)
             continue
@@ -305,7 +210,7 @@ def body_velocity(
             if feature in remembered:
                 memory, (value,) = remembered[feature]
                 (before,) = means.get(feature, (0.0,))
-                gained = memory.feature(*ideal[:2], memory.over(before, value, step_s))
+                gained = memory.feature(*ideal[:2], _over(memory, before, value, step_s))
             else:
                 gained = BODY_FEATURES[feature](*ideal)
             total = total + k * np.clip(gained, -reach, reach)
@@ -332,7 +237,7 @@ def step(
     remembered |= _body_remembered(theta, *_ideal(theta, mean_left, mean_right))
     means = {
         name: tuple(
-            memory.after(before, value, step_s)
+            _after(memory, before, value, step_s)
             for before, value in zip(state.means.get(name, (0.0,) * len(values)), values, strict=True)
         )
         for name, (memory, values) in remembered.items()

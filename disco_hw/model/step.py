@@ -42,6 +42,7 @@ from disco_hw.model.added_terms import (
     count_means,
     new_means,
     terms_need_change,
+    written_out,
 )
 from disco_hw.model.coefficients import MOVES_RAD_S, NO_SLIDE, Base, Coefficients, Integration, base_point, effect_point
 from disco_hw.model.model import Model, coefficient_tables
@@ -322,11 +323,9 @@ def _delay_cells(coefficients: tuple[float, ...] | None) -> int:
 def _made(name: str, arguments: str, lines: list[str], summary: str) -> Callable[..., Any]:
     scope: dict[str, Any] = {f"term_{effect.name}": effect.term for effect in REGISTRY.values() if effect.moves}
     scope |= {"plus": _plus, "whole": _delay_cells, "terms_need_change": terms_need_change}
-    body = "\n".join(f"    {line}" for line in lines)
-    exec(f"def {name}({arguments}):\n{body}", scope)
-    scope[name].__doc__ = summary
-    made: Callable[..., Any] = scalar_function(scope[name])
-    return made
+    made = written_out(name, arguments, lines, scope)
+    made.__doc__ = summary
+    return scalar_function(made)
 
 
 delay_steps = _made(
@@ -354,10 +353,7 @@ body_terms = _made(
     "Forward speed (m/s), lateral speed of the axle (m/s) or None, half the yaw rate (rad/s), from the wheels' means.",
 )
 world_terms = _made(
-    "world_terms",
-    "x, y, wheel_sum, difference, time_s, effects",
-    _world_lines(),
-    "Position (m) at the end of a step.",
+    "world_terms", "x, y, wheel_sum, difference, time_s, effects", _world_lines(), "Position (m) at the end of a step."
 )
 needs_change = _made(
     "needs_change",

@@ -229,7 +229,7 @@ def term_name(target: str, feature: str) -> str:
 
 
 def _nothing_plain() -> None:
-    """`disco_hw.model.plain` has the features itself."""
+    """Terms have features instead, which `disco_hw.model.plain` adds up."""
 
 
 def _coefficients(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:

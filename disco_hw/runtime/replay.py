@@ -84,7 +84,7 @@ class ReplayReport:
     missing_ticks: int
     recorded_by: str
     difference: Difference | None
-    tolerance: float = 0.0
+    tolerance: float
 
     @property
     def ok(self) -> bool:

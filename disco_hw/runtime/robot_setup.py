@@ -18,7 +18,7 @@ import msgspec
 
 from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config, refuse_outside_task
 from disco_hw.errors import InputError
-from disco_hw.fence.outlines import fence_outlines, footprint_outline
+from disco_hw.fence.clearance import fence_outlines, footprint_outline
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
 from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND

@@ -52,6 +52,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from disco_hw.errors import FieldFault
+from drivers.samples import FARTHEST_M
+
 Array = NDArray[np.float64]
 Point = tuple[float, float]
 # Chosen: slower could hardly be told from a robot that stands.
@@ -85,12 +88,33 @@ class Editable(NamedTuple):
     label: str
 
 
-class TaskFault(NamedTuple):
-    """Fault of a task that no single field shows: the field to change, the fault, the remedy."""
+def beyond_poses(figure: str, size: str, center_m: Point, reach_m: float) -> FieldFault | None:
+    """Return the fault of a figure about a centre, of which `size` is the field, that goes where no pose is known."""
+    for field, coordinate_m in zip(("center_x_m", "center_y_m"), center_m, strict=True):
+        farthest_m = abs(coordinate_m) + reach_m
+        if farthest_m > FARTHEST_M:
+            return FieldFault(
+                field,
+                f"with this {size} the {figure} reaches {farthest_m:g} m from the origin; poses reach {FARTHEST_M:g} m "
+                "at most",
+                f"write a {figure} in the frame of the poses",
+            )
+    return None
 
-    field: str
-    fault: str
-    hint: str
+
+def too_fast(
+    speed_m_s: float, fastest_m_s: float, robot: Chassis, wheels: str, where: str = "", instead: str = ""
+) -> str | None:
+    """Return why these `wheels` of the nominal robot cannot do a speed, and the remedy; None if they can.
+
+    `where`: what follows the speed, such as " on a radius of 1 m"; `instead`: another remedy, such as ", or ...".
+    """
+    if speed_m_s <= fastest_m_s:
+        return None
+    return (
+        f"{speed_m_s:g} m/s{where} needs more than {robot.max_wheel_speed_rad_s:g} rad/s of {wheels}; write at most "
+        f"{math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s{instead}"
+    )
 
 
 class Course(Protocol):
@@ -171,9 +195,6 @@ class PlannedTask(Protocol):
         the first), the steps that will be planned, and how far ahead of the tracked point the robot turns.
         """
 
-    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
-        """Cost of being here at this time with this speed, for figures and displays."""
-
 
 class RobotTask(Protocol):
     """A kind of task: a frozen msgspec struct whose fields are those of [task] in robot.toml."""
@@ -204,7 +225,7 @@ class RobotTask(Protocol):
         Raises InputError naming file, line and remedy.
         """
 
-    def fault(self) -> TaskFault | None:
+    def fault(self) -> FieldFault | None:
         """Return what is wrong with the fields of [task] taken together, or None."""
 
     def fastest_m_s(self, robot: Chassis) -> float:

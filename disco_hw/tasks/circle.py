@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple, Self
 import msgspec
 import numpy as np
 
-from disco_hw.errors import InputError
+from disco_hw.errors import FieldFault, InputError
 from disco_hw.tasks import (
     CENTER_M,
     SLOWEST_M_S,
@@ -24,12 +24,12 @@ from disco_hw.tasks import (
     Positive,
     Prepared,
     RobotTask,
-    TaskFault,
+    beyond_poses,
     norm,
     norm_and_inverse,
     single,
+    too_fast,
 )
-from drivers.samples import FARTHEST_M
 
 RADIUS_M = (0.1, 50.0)
 """Least and largest radius that a person may change it to."""
@@ -47,6 +47,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     implied_by: ClassVar[str | None] = ""
     read_fields: ClassVar[tuple[str, ...]] = ()
+    file: ClassVar[str | None] = None
 
     center_x_m: float = 0.0
     center_y_m: float = 0.0
@@ -58,27 +59,13 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         """The speed of [task]."""
         return self.speed_m_s
 
-    @property
-    def file(self) -> str | None:
-        """Always None, because a circle is described by its fields alone."""
-        return None
-
     def with_file(self, _file: Path, _robot: Chassis, _x_icr_m: float | None) -> Self:
         """Return the task unchanged, because it has no file."""
         return self
 
-    def fault(self) -> TaskFault | None:
+    def fault(self) -> FieldFault | None:
         """Return a fault for a circle that goes where no pose is known, else None."""
-        for field in ("center_x_m", "center_y_m"):
-            farthest_m = abs(getattr(self, field)) + self.radius_m
-            if farthest_m > FARTHEST_M:
-                return TaskFault(
-                    field,
-                    f"with this radius_m the circle reaches {farthest_m:g} m from the origin; poses reach "
-                    f"{FARTHEST_M:g} m at most",
-                    "write a circle in the frame of the poses",
-                )
-        return None
+        return beyond_poses("circle", "radius_m", (self.center_x_m, self.center_y_m), self.radius_m)
 
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which the outer wheel is at its limit."""
@@ -87,13 +74,13 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     def too_fast(self, robot: Chassis) -> str | None:
         """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
-        fastest = self.fastest_m_s(robot)
-        if self.speed_m_s <= fastest:
-            return None
-        return (
-            f"{self.speed_m_s:g} m/s on a radius of {self.radius_m:g} m needs more than "
-            f"{robot.max_wheel_speed_rad_s:g} rad/s of the outer wheel; write at most "
-            f"{math.floor(fastest * 1000.0) / 1000.0:g} m/s, or a larger radius"
+        return too_fast(
+            self.speed_m_s,
+            self.fastest_m_s(robot),
+            robot,
+            "the outer wheel",
+            where=f" on a radius of {self.radius_m:g} m",
+            instead=", or a larger radius",
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
@@ -261,11 +248,6 @@ class CircleCost:
         return np.array([self.center_x_m, self.center_y_m]) + self.radius_m * np.column_stack(
             [np.cos(angle), np.sin(angle)]
         )
-
-    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
-        """Return the paper's instant cost of a state."""
-        distance = math.hypot(x_m - self.center_x_m, y_m - self.center_y_m) - self.radius_m
-        return math.hypot(distance, forward_m_s - self.speed_m_s)
 
 
 class CircleTerms(NamedTuple):

@@ -12,11 +12,11 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from disco_hw.tasks import CENTER_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, TaskFault
+from disco_hw.errors import FieldFault
+from disco_hw.tasks import CENTER_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, beyond_poses, too_fast
 from disco_hw.tasks.line import PathTable, planned_table
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, PathProgress, line_course
-from drivers.samples import FARTHEST_M
 
 # Chosen: smaller than most robots turn in, up to far larger than a hall.
 SIZE_M = (0.3, 50.0)
@@ -35,6 +35,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     implied_by: ClassVar[str | None] = None
     read_fields: ClassVar[tuple[str, ...]] = ()
+    file: ClassVar[str | None] = None
 
     center_x_m: float = 0.0
     center_y_m: float = 0.0
@@ -46,27 +47,13 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
         """The speed of [task]."""
         return self.speed_m_s
 
-    @property
-    def file(self) -> str | None:
-        """Always None, because a lemniscate is described by its fields alone."""
-        return None
-
     def with_file(self, _file: Path, _robot: Chassis, _x_icr_m: float | None) -> Self:
         """Return the task unchanged, because it has no file."""
         return self
 
-    def fault(self) -> TaskFault | None:
+    def fault(self) -> FieldFault | None:
         """Return a fault for a figure that goes where no pose is known, else None."""
-        for field in ("center_x_m", "center_y_m"):
-            farthest_m = abs(getattr(self, field)) + self.size_m
-            if farthest_m > FARTHEST_M:
-                return TaskFault(
-                    field,
-                    f"with this size_m the figure reaches {farthest_m:g} m from the origin; poses reach "
-                    f"{FARTHEST_M:g} m at most",
-                    "write a figure in the frame of the poses",
-                )
-        return None
+        return beyond_poses("figure", "size_m", (self.center_x_m, self.center_y_m), self.size_m)
 
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which the outer wheel is at its limit in the tightest bend."""
@@ -75,13 +62,13 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     def too_fast(self, robot: Chassis) -> str | None:
         """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
-        fastest = self.fastest_m_s(robot)
-        if self.speed_m_s <= fastest:
-            return None
-        return (
-            f"{self.speed_m_s:g} m/s on a figure of {self.size_m:g} m needs more than "
-            f"{robot.max_wheel_speed_rad_s:g} rad/s of the outer wheel; write at most "
-            f"{math.floor(fastest * 1000.0) / 1000.0:g} m/s, or a larger size"
+        return too_fast(
+            self.speed_m_s,
+            self.fastest_m_s(robot),
+            robot,
+            "the outer wheel",
+            where=f" on a figure of {self.size_m:g} m",
+            instead=", or a larger size",
         )
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:

@@ -10,14 +10,15 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from disco_hw.errors import InputError
-from disco_hw.tasks import Chassis, Editable, Point, Positive, TaskFault
+from disco_hw.errors import FieldFault, InputError
+from disco_hw.tasks import Chassis, Editable, Point, Positive
 from disco_hw.tasks.line import PathTable, check_size, load_waypoints, planned_table, points_of
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import (
     LineCourse,
     PathProgress,
     line_course,
+    refuse_hairpins,
     speed_range,
     straight_fastest_m_s,
     straight_too_fast,
@@ -62,13 +63,10 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
             )
         check_size(file, found)
         if x_icr_m is not None:
-            # Loaded where it is needed alone: half of the daemon's commands need no path.
-            from disco_hw.tasks.line.course import refuse_hairpins  # noqa: PLC0415
-
             refuse_hairpins(file, found, x_icr_m)
         return msgspec.structs.replace(self, points=points_of(found))
 
-    def fault(self) -> TaskFault | None:
+    def fault(self) -> FieldFault | None:
         """Return None: only the way-points' file can be wrong."""
         return None
 

@@ -13,8 +13,8 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from disco_hw.errors import InputError
-from disco_hw.tasks import Array, Chassis, Editable, Found, Point, Prepared, TaskFault, norm, single
+from disco_hw.errors import FieldFault, InputError
+from disco_hw.tasks import Array, Chassis, Editable, Found, Point, Prepared, norm, single
 from disco_hw.tasks.line import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.line.cost import AGAINST_M
 from disco_hw.tasks.line.course import (
@@ -41,6 +41,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     implied_by: ClassVar[str | None] = None
     read_fields: ClassVar[tuple[str, ...]] = ("points", "times_s")
+    reference_speed_m_s: ClassVar[float] = math.nan
 
     path: Annotated[str, Meta(min_length=1)]
     points: tuple[Point, ...] = ()
@@ -51,11 +52,6 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """The fastest that the times ask for, straight from one way-point to the next; 0 before they are read."""
         ways = zip(self.points, self.points[1:], self.times_s, self.times_s[1:], strict=False)
         return max((math.dist(here, there) / (then - now) for here, there, now, then in ways), default=0.0)
-
-    @property
-    def reference_speed_m_s(self) -> float:
-        """Always NaN, because a timed path has no single reference speed."""
-        return math.nan
 
     @property
     def file(self) -> str | None:
@@ -93,7 +89,7 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             )
         return msgspec.structs.replace(self, points=points_of(found), times_s=tuple(times.tolist()))
 
-    def fault(self) -> TaskFault | None:
+    def fault(self) -> FieldFault | None:
         """Return None: only the way-points' file can be wrong."""
         return None
 
@@ -176,14 +172,10 @@ class TimedPathCost:
 
     The place moves on by itself, so nothing but following it is cheap. Facing is as of `PathCost`, against the way that
     the place goes, so that it is not followed backwards; while the place rests it is nothing. Before the first time
-    the place is the first way-point, after the last the last one. Raises ValueError for way-points without times.
+    the place is the first way-point, after the last the last one.
     """
 
     waypoints: Waypoints
-
-    def __post_init__(self) -> None:
-        if self.waypoints.times_s is None:
-            raise ValueError("the way-points have no times")
 
     def _where(self, time_s: NDArray[np.floating]) -> tuple[Array, Array]:
         times, places = self.waypoints.times_s, self.waypoints.places_m
@@ -202,11 +194,6 @@ class TimedPathCost:
         length[length < RESTS_M] = np.inf
         columns = (x[1:] - x[0], y[1:] - y[0], along_x / length, along_y / length)
         return Prepared(TimedPathTerms(*(column.astype(np.float32) for column in columns)), (float(x[0]), float(y[0])))
-
-    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
-        """Distance to where the robot should be."""
-        x, y = self._where(np.array(time_s))
-        return float(np.hypot(x - x_m, y - y_m))
 
 
 class TimedPathTerms(NamedTuple):

@@ -12,7 +12,7 @@ import viser
 from numpy.typing import NDArray
 
 from disco_hw.fence import Fence, Footprint
-from disco_hw.fence.outlines import circle_outline, footprint_outline
+from disco_hw.fence.clearance import circle_outline, footprint_outline
 from disco_hw.log import records
 from disco_hw.runtime.safe_area import fence_of_record
 

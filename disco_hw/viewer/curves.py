@@ -145,18 +145,12 @@ def _window(
 Cut = Callable[[RobotTask, Timeline, int, int], Curves]
 
 
-@dataclass(frozen=True, slots=True)
-class _Plot:
-    handle: viser.GuiUplotHandle
-    cut: Cut
-
-
 class Plots:
     """Curves of the 20 s before an instant; a folder that is closed costs what an open one does, so all are drawn."""
 
     def __init__(self, gui: viser.GuiApi, stage: ShownRobot) -> None:
         self._model = stage.model
-        self._plots: list[_Plot] = []
+        self._plots: list[tuple[viser.GuiUplotHandle, Cut]] = []
         self._marginals: dict[str, viser.GuiUplotHandle] = {}
         self._belief: BeliefChange | None = None
         with gui.add_folder("Plots"):
@@ -175,11 +169,10 @@ class Plots:
 
     def show(self, timeline: Timeline, at_ns: int, task: RobotTask, belief: BeliefChange | None) -> None:
         """Draw the curves up to an instant, with the task and the belief that are in force then."""
-        for plot in self._plots:
-            found = plot.cut(task, timeline, at_ns - WINDOW_NS, at_ns)
-            columns = _columns(found)
+        for handle, cut in self._plots:
+            columns = _columns(cut(task, timeline, at_ns - WINDOW_NS, at_ns))
             if len(columns[0]) >= 2:
-                plot.handle.data = columns
+                handle.data = columns
         if belief is not self._belief:
             self._belief = belief
             self._show_belief(model_in_force(self._model, belief))
@@ -195,7 +188,7 @@ class Plots:
     ) -> None:
         empty = cut(default_task(), Timeline(), 0, 0)
         blank = Curves(np.array((0.0, 1.0)), {name: np.zeros(2) for name in empty.values})
-        self._plots.append(_Plot(_add_uplot(gui, title, blank, right, least), cut))
+        self._plots.append((_add_uplot(gui, title, blank, right, least), cut))
 
 
 def _any_task(cut: Callable[[Timeline, int, int], Curves]) -> Cut:

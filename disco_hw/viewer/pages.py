@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +54,36 @@ class _Due:
         return True
 
 
+class _Column:
+    """What both pages show beside the scene: state, motions driven by hand, plots, events, and all other figures."""
+
+    def __init__(self, gui: viser.GuiApi, stage: ShownRobot) -> None:
+        self._stage = stage
+        self.state = gui.add_markdown("")
+        with gui.add_folder("Motions driven so far", visible=False) as self.motions:
+            self.coverage = gui.add_markdown("")
+        self._plots = Plots(gui, stage)
+        with gui.add_folder("Events"):
+            self.events = gui.add_markdown("nothing yet")
+        with gui.add_folder("All figures", expand_by_default=False):
+            self.details = gui.add_markdown("")
+
+    def show(
+        self, state: str, details: str, motions: Sequence[Mapping[str, Any]] | None, timeline: Timeline,
+        snapshot: Snapshot | None, first_ns: int | None,
+    ) -> None:  # fmt: skip
+        """Show texts, coverage of the motions (None: nobody drives by hand), plots, and events up to the snapshot."""
+        _set(self.state, state)
+        _set(self.details, details)
+        if self.motions.visible != (motions is not None):
+            self.motions.visible = motions is not None
+        if motions is not None:
+            _set(self.coverage, coverage_text(motions))
+        _set(self.events, events_text(snapshot, first_ns))
+        if snapshot is not None:
+            self._plots.show(timeline, snapshot.t_ns, self._stage.task_at(snapshot.task), snapshot.belief)
+
+
 class LivePage:
     """Everything on the live page; `step` waits for the feed and draws what has come."""
 
@@ -66,14 +96,7 @@ class LivePage:
         self._redraw = _Due(LIVE_REDRAW_S)
         gui = server.gui
         gui.main_panel.dock_right()
-        self._summary = gui.add_markdown("")
-        with gui.add_folder("Motions driven so far", visible=False) as self._excited:
-            self._coverage = gui.add_markdown("")
-        self._plots = Plots(gui, stage)
-        with gui.add_folder("Events"):
-            self._events = gui.add_markdown("nothing yet")
-        with gui.add_folder("All figures", expand_by_default=False):
-            self._details = gui.add_markdown("")
+        self._column = _Column(gui, stage)
         self.scene = Scene(server, stage)
         self._views = Views(server, stage.task)
         self.editor = TaskEditor(server, desk.drag)
@@ -107,13 +130,11 @@ class LivePage:
         self.editor.show(self._stage.task_at(None if snapshot is None else snapshot.task), self._desk.draft)
         if everything:
             behind_ms = None if snapshot is None else (time.monotonic_ns() - snapshot.t_ns) * 1e-6
-            _set(self._summary, live_summary(status, snapshot, self.scene.knows_task))
-            _set(self._details, live_details(status, snapshot, self._subscriber.missed, behind_ms))
-            self._show_coverage(status)
-            _set(self._events, events_text(snapshot, self.timeline.first_ns))
-            if snapshot is not None:
-                task = self._stage.task_at(snapshot.task)
-                self._plots.show(self.timeline, snapshot.t_ns, task, snapshot.belief)
+            summary = live_summary(status, snapshot, self.scene.knows_task)
+            details = live_details(status, snapshot, self._subscriber.missed, behind_ms)
+            drive = (status or {}).get("drive")
+            motions = None if drive is None else drive["coverage"]["items"]
+            self._column.show(summary, details, motions, self.timeline, snapshot, self.timeline.first_ns)
 
     def _shade(self) -> None:
         self._desk.dark = self.scene.background == DARK
@@ -125,13 +146,6 @@ class LivePage:
     def _snapshot(self) -> Snapshot | None:
         newest = self.timeline.last_ns
         return None if newest is None else snapshot_at(self.timeline, newest, self.timeline.plans.last(newest))
-
-    def _show_coverage(self, status: dict[str, Any] | None) -> None:
-        drive = (status or {}).get("drive")
-        if self._excited.visible != (drive is not None):
-            self._excited.visible = drive is not None
-        if drive is not None:
-            _set(self._coverage, coverage_text(drive["coverage"]["items"]))
 
     def _learn_task(self, status: dict[str, Any] | None) -> None:
         """Take over the daemon's task: it may have been changed before this page was opened."""
@@ -233,20 +247,16 @@ class ReplayPage:
         self._marks = marks_of(recording.timeline)
         gui = server.gui
         gui.main_panel.dock_right()
+        shown = tuple(round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS))
+        duration_s = max(recording.duration_s, 0.001)
+        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, round(self.t_s, 3), marks=shown)
+        self._play_button = gui.add_button("Play")
         self._add_controls(gui)
-        self._bar = self._scrub_bar(server)
-        self._state = gui.add_markdown("")
+        self._bar = ScrubBar(server, duration_s, shown, self.stay_at)
         stage = recording.stage
+        self._column = _Column(gui, stage)
         self._excited = Excited(recording.timeline, stage.drive_top_rad_s)
-        if self._excited.driven:
-            with gui.add_folder("Motions driven so far"):
-                self._coverage = gui.add_markdown("")
-        self._plots = Plots(gui, stage)
-        with gui.add_folder("Events"):
-            self._events = gui.add_markdown("")
-        with gui.add_folder("All figures", expand_by_default=False):
-            self._details = gui.add_markdown("")
-        self.scene = Scene(server, recording.stage)
+        self.scene = Scene(server, stage)
         self._views = Views(server, stage.task)
         add_layers(server, self.scene, self._redraw)
 
@@ -256,10 +266,14 @@ class ReplayPage:
             self.t_s = min(max(t_s, 0.0), self._recording.duration_s)
             self._changed = True
 
+    def stay_at(self, t_s: float) -> None:
+        """Go to a time, within the log, and stay there."""
+        self._play(False)
+        self.go_to(t_s)
+
     def step_ticks(self, count: int) -> None:
         """Go this many ticks forward or back, and stay there."""
-        self._play(False)
-        self.go_to(self._recording.seconds_of(self._recording.tick_at(self.t_s) + count))
+        self.stay_at(self._recording.seconds_of(self._recording.tick_at(self.t_s) + count))
 
     def step(self, passed_s: float) -> None:
         """Advance by this much real time if playing, and draw if anything has changed."""
@@ -282,14 +296,10 @@ class ReplayPage:
         self._slider.value = round(t_s, 3)  # type: ignore[misc]
         if everything:
             self._next_redraw_s = now_s + REPLAY_REDRAW_S
-            first_ns = self._recording.first_ns
-            task = self._recording.stage.task_at(snapshot.task)
-            self._state.content = replay_text(snapshot, first_ns, task)
-            self._details.content = replay_details(snapshot)
-            if self._excited.driven:
-                self._coverage.content = coverage_text(self._excited.items(snapshot.t_ns))
-            self._events.content = events_text(snapshot, first_ns)
-            self._plots.show(self._recording.timeline, snapshot.t_ns, task, snapshot.belief)
+            first_ns, timeline = self._recording.first_ns, self._recording.timeline
+            state = replay_text(snapshot, first_ns, self._recording.stage.task_at(snapshot.task))
+            motions = self._excited.items(snapshot.t_ns) if self._excited.driven else None
+            self._column.show(state, replay_details(snapshot), motions, timeline, snapshot, first_ns)
 
     def _redraw(self) -> None:
         with self._lock:
@@ -300,10 +310,6 @@ class ReplayPage:
         self._play_button.label = "Pause" if playing else "Play"
 
     def _add_controls(self, gui: viser.GuiApi) -> None:
-        duration_s = max(self._recording.duration_s, 0.001)
-        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
-        self._slider = gui.add_slider("Time (s)", 0.0, duration_s, 0.001, round(self.t_s, 3), marks=tuple(shown))
-        self._play_button = gui.add_button("Play")
         steps = gui.add_button_group("Step", ("-10", "-1", "+1", "+10"))
         speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1")
         listed = {self._line(mark): mark for mark in _spread(self._marks, _LISTED_MARKS)}
@@ -313,8 +319,7 @@ class ReplayPage:
         def _(event: Any) -> None:
             # Without a client it was moved from here.
             if event.client is not None:
-                self._play(False)
-                self.go_to(float(event.target.value))
+                self.stay_at(float(event.target.value))
 
         @self._play_button.on_click
         def _(_: Any) -> None:
@@ -335,16 +340,7 @@ class ReplayPage:
         def _(event: Any) -> None:
             mark = listed.get(event.target.value)
             if mark is not None:
-                self._play(False)
-                self.go_to(self._seconds(mark))
-
-    def _scrub_bar(self, server: viser.ViserServer) -> ScrubBar:
-        def go_to(t_s: float) -> None:
-            self._play(False)
-            self.go_to(t_s)
-
-        shown = [round(self._seconds(mark), 3) for mark in _spread(self._marks, _SLIDER_MARKS)]
-        return ScrubBar(server, max(self._recording.duration_s, 0.001), shown, go_to)
+                self.stay_at(self._seconds(mark))
 
     def _seconds(self, mark: Mark) -> float:
         return (mark.t_ns - self._recording.first_ns) * 1e-9

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from disco_hw.errors import InputError
-from disco_hw.fence.outlines import fence_outlines
+from disco_hw.fence.clearance import fence_outlines
 from disco_hw.viewer import curves, scene
 from disco_hw.viewer.area import fence_in_force, obstacle_outlines, stopping_outlines
 from disco_hw.viewer.curves import WINDOW_NS, Curves
@@ -135,35 +135,35 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
 
 def _draw_scene(axes: Axes, snapshot: Snapshot, stage: ShownRobot) -> None:
     course = stage.task_at(snapshot.task).course()
-    axes.plot(*course.outline_m().T, color=_web(scene.TASK_COLOUR), linewidth=2.5)
+    axes.plot(*course.outline_m().T, color=_web("task"), linewidth=2.5)
     trail = snapshot.trail
     if len(trail) >= 2:
         colours = scene.distance_colours(course.off_m(trail), scene.TRAIL_FULL_M) / 255.0
         axes.add_collection(LineCollection(list(np.stack((trail[:-1], trail[1:]), axis=1)), colors=colours[1:], lw=1.5))
     if len(snapshot.poses):
-        axes.plot(*snapshot.poses[:, :2].T, ".", color=_web(scene.POSES_COLOUR), markersize=3)
+        axes.plot(*snapshot.poses[:, :2].T, ".", color=_web("poses"), markersize=3)
     if snapshot.fan is not None:
         paths = scene.fan_paths(snapshot.fan.weights, snapshot.fan.x_m, snapshot.fan.y_m)
-        shades = scene.weight_colours(snapshot.fan.weights, scene.FAN_COLOUR, scene.FAN_PALEST) / 255.0
+        shades = scene.weight_colours(snapshot.fan.weights, scene.LAYERS["fan"].colour, scene.FAN_PALEST) / 255.0
         for path, shade in zip(paths[::-1], shades[::-1], strict=True):
             axes.plot(*path.T, color=tuple(shade), linewidth=1.2)
     if snapshot.plan is not None:
         points = ParameterPoints(model_in_force(stage.model, snapshot.belief))
         for path in points.trajectories(snapshot.plan, snapshot.wheel_speeds or (0.0, 0.0)):
-            axes.plot(*path.T, color=_web(scene.POINTS_COLOUR), linewidth=0.8)
-        axes.plot(snapshot.plan.path_x_m, snapshot.plan.path_y_m, color=_web(scene.PLAN_COLOUR), linewidth=2.0)
+            axes.plot(*path.T, color=_web("points"), linewidth=0.8)
+        axes.plot(snapshot.plan.path_x_m, snapshot.plan.path_y_m, color=_web("plan"), linewidth=2.0)
     if snapshot.pose is not None:
         body, nose = _outline(snapshot.pose, stage.axial_distance_m)
-        axes.fill(*body.T, color=_web(scene.BODY_COLOUR), alpha=0.8)
+        axes.fill(*body.T, color=_web("robot"), alpha=0.8)
         axes.fill(*nose.T, color="gold")
         for line in stopping_outlines(snapshot.guard, stage.footprint):
-            axes.plot(*line.T, color=_web(scene.STOP_COLOUR), linewidth=1.2)
+            axes.plot(*line.T, color=_web("stop"), linewidth=1.2)
         ellipse = scene.ellipse_points(*snapshot.pose[:2], snapshot.covariance[:2, :2])
-        axes.plot(*ellipse.T, color=_web(scene.ELLIPSE_COLOUR), linewidth=1.2)
+        axes.plot(*ellipse.T, color=_web("ellipse"), linewidth=1.2)
     for line in fence_outlines(fence_in_force(stage.fence, snapshot.fence)):
-        axes.plot(*line.T, color=_web(scene.FENCE_COLOUR), linewidth=1.6)
+        axes.plot(*line.T, color=_web("fence"), linewidth=1.6)
     for line in obstacle_outlines(snapshot.guard):
-        axes.fill(*line.T, color=_web(scene.OBSTACLE_COLOUR), alpha=0.6)
+        axes.fill(*line.T, color=_web("obstacles"), alpha=0.6)
     (x_m, y_m), reach = course.middle_m, 1.5 * course.reach_m + 0.3
     axes.set(
         xlim=(x_m - reach, x_m + reach),
@@ -182,8 +182,9 @@ def _outline(pose: tuple[float, float, float], size_m: float) -> tuple[Array, Ar
     return body @ turn + (x_m, y_m), nose @ turn + (x_m, y_m)
 
 
-def _web(colour: tuple[int, int, int]) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*colour)
+def _web(layer: str) -> str:
+    """Return the colour of a layer as matplotlib takes it."""
+    return "#{:02x}{:02x}{:02x}".format(*scene.LAYERS[layer].colour)
 
 
 # Chosen: as above, for the page that is written to a file.

@@ -59,7 +59,6 @@ class Snapshot:
     covariance: Array
     speed_m_s: float
     yaw_rate_rad_s: float
-    wheels_healthy: bool
     pose_healthy: bool
     wheel_angles: tuple[float, float]
     wheel_speeds: tuple[float, float] | None
@@ -72,7 +71,6 @@ class Snapshot:
     state: records.DaemonState | None
     status: RobotStatus | None
     link: RobotLinkHealth | None
-    counters: records.Counters | None
     lateness_us: float
     overruns: int
     skipped: int
@@ -100,12 +98,11 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         covariance=covariance,
         speed_m_s=np.nan if values is None else values["speed_m_s"],
         yaw_rate_rad_s=np.nan if values is None else values["yaw_rate_rad_s"],
-        wheels_healthy=values is not None and bool(values["wheels_healthy"]),
         pose_healthy=values is not None and bool(values["pose_healthy"]),
         wheel_angles=(0.0, 0.0) if wheels is None else (float(wheels[1][0]), float(wheels[1][1])),
         wheel_speeds=None if wheels is None else (float(wheels[1][2]), float(wheels[1][3])),
-        command=None if command is None else (float(command[1][2]), float(command[1][3])),
-        in_force=command is not None and bool(command[1][4]),
+        command=None if command is None else (float(command[1][0]), float(command[1][1])),
+        in_force=command is not None and bool(command[1][2]),
         source=timeline.source.last(t_ns) or "",
         plan=_fresh(plan, t_ns, PLAN_AGE_NS),
         poses=timeline.pose.rows(t_ns - POSES_NS, t_ns)[1][-_POSES:],
@@ -113,7 +110,6 @@ def snapshot_at(timeline: Timeline, t_ns: int, plan: records.Plan | None) -> Sna
         state=timeline.state.last(t_ns),
         status=timeline.status.last(t_ns),
         link=timeline.link.last(t_ns),
-        counters=timeline.counters.last(t_ns),
         lateness_us=np.nan if loop is None else float(loop[1][0]) * 1e-3,
         overruns=0 if loop is None else int(loop[1][1]),
         skipped=0 if loop is None else int(loop[1][2]),
@@ -234,13 +230,6 @@ def stage_of_robot(robot_file: Path, model_file: Path | None = None) -> ShownRob
     return _stage(load_setup(robot_file, model_file))
 
 
-def stage_of_log(log: Log, robot_file: Path | None = None) -> ShownRobot:
-    """Create the stage from the files kept in the log, or from `robot_file`; raises InputError without either."""
-    if robot_file is not None:
-        return stage_of_robot(robot_file)
-    return _stage(setup_of_log(log, "name the robot with --robot"))
-
-
 def _stage(setup: Setup) -> ShownRobot:
     robot = setup.config.robot
     return ShownRobot(
@@ -269,7 +258,8 @@ class Recording:
         try:
             if "/estimate" not in self._log.counts:
                 raise InputError(f"{path}: holds no estimates, so there is nothing to show; give a log of `run`")
-            self.stage: ShownRobot = stage_of_log(self._log, robot_file)
+            setup = load_setup(robot_file) if robot_file else setup_of_log(self._log, "name the robot with --robot")
+            self.stage: ShownRobot = _stage(setup)
             self.timeline = Timeline()
             for now_ns, record in self._log.brief_records(_SHOWN):
                 self.timeline.add(now_ns, record)

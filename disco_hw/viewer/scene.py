@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from disco_hw.fence.outlines import fence_outlines
+from disco_hw.fence.clearance import circle_outline, fence_outlines
 from disco_hw.log import records
 from disco_hw.tasks import RobotTask
 from disco_hw.viewer.area import fence_in_force, obstacle_outlines, stopping_outlines
@@ -22,51 +23,37 @@ Array = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Point = tuple[float, float, float]
 
-# Chosen: red, green and blue, apart from one another on the light and the dark ground.
-TASK_COLOUR = (40, 110, 230)
-BODY_COLOUR = (200, 60, 160)
-WHEEL_COLOUR = (45, 45, 50)
-PLAN_COLOUR = (250, 140, 0)
-POINTS_COLOUR = (150, 110, 200)
-FAN_COLOUR = (0, 105, 125)
-POSES_COLOUR = (125, 125, 132)
-ELLIPSE_COLOUR = (120, 40, 200)
-CENTRE_COLOUR = (0, 0, 0)
-FENCE_COLOUR = (190, 30, 30)
-OBSTACLE_COLOUR = (225, 95, 20)
-STOP_COLOUR = (20, 140, 60)
 
-LAYER_COLOURS = {
-    "task": TASK_COLOUR,
-    "robot": BODY_COLOUR,
-    "trail": (68, 33, 253),
-    "plan": PLAN_COLOUR,
-    "fan": FAN_COLOUR,
-    "points": POINTS_COLOUR,
-    "ellipse": ELLIPSE_COLOUR,
-    "poses": POSES_COLOUR,
-    "centre": CENTRE_COLOUR,
-    "fence": FENCE_COLOUR,
-    "obstacles": OBSTACLE_COLOUR,
-    "stop": STOP_COLOUR,
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """Layer of the scene: what the legend calls it, its colour (red, green, blue), and its lines' width in pixels."""
+
+    label: str
+    colour: tuple[int, int, int]
+    width_px: float = 0.0
+
+
+# Chosen: colours apart from one another on the light and the dark ground. Widths are in pixels, and the grid is of
+# lines instead of the library's own: where no graphics card draws, a line of a width in metres is drawn twice by a dear
+# shader, and grid, shadows and environment map cost ten times as much as all else together.
+LAYERS = {
+    "task": Layer("Task", (40, 110, 230), 3.5),
+    "robot": Layer("Robot", (200, 60, 160)),
+    "trail": Layer("Driven trail", (68, 33, 253), 4.0),
+    "plan": Layer("Planned trajectory", (250, 140, 0), 3.5),
+    "fan": Layer("Sampled rollouts by weight", (0, 105, 125), 1.5),
+    "points": Layer("Plan under sigma points", (150, 110, 200), 1.5),
+    "ellipse": Layer("95 % of the position", (120, 40, 200), 2.0),
+    "poses": Layer("Measured poses, 3 s", (125, 125, 132), 2.5),
+    "centre": Layer("Turning centre (ICR)", (0, 0, 0), 1.5),
+    "fence": Layer("Fence", (190, 30, 30), 3.0),
+    "obstacles": Layer("Obstacles", (225, 95, 20), 3.0),
+    "stop": Layer("Stopping path and footprint", (20, 140, 60), 2.0),
 }
+_WHEEL_COLOUR = (45, 45, 50)
+_GRID_PX = 1.5
 TRAIL_FULL_M = 0.1
 """Distance to the task at which the trail is wholly yellow."""
-
-LAYERS = {
-    "task": "Task",
-    "robot": "Robot",
-    "trail": "Driven trail",
-    "plan": "Planned trajectory",
-    "fan": "Sampled rollouts by weight",
-    "points": "Plan under sigma points",
-    "ellipse": "95 % of the position",
-    "poses": "Measured poses, 3 s",
-    "centre": "Turning centre (ICR)",
-    "fence": "Fence",
-    "obstacles": "Obstacles",
-    "stop": "Stopping path and footprint",
-}
 # What lies on the floor, from below: a trail of many laps must hide neither the task nor the rollouts.
 _FENCE_M = 0.004
 _TRAIL_M, _POSES_M, _TASK_M, _FAN_M, _POINTS_M, _PLAN_M = 0.002, 0.003, 0.005, (0.0095, 0.007), 0.011, 0.013
@@ -76,13 +63,8 @@ _TRAIL_REACHES = 10.0
 LIGHT, DARK = (255.0, 255.0, 255.0), (20.0, 20.0, 24.0)
 _CENTRE_LIMIT_M = 5.0
 FAN_PALEST = 0.12
+_NO_LINES: Array = np.empty((0, 2, 3))
 _WHEEL_PARTS = (("front", 0.5), ("rear", -0.5))
-# Widths in pixels, and lines instead of the library's grid: where no graphics card draws, a line of a width in metres
-# is drawn twice by a dear shader, and grid, shadows and environment map cost ten times as much as all else together.
-_WIDTH_PX = {
-    "task": 3.5, "trail": 4.0, "plan": 3.5, "fan": 1.5, "points": 1.5, "ellipse": 2.0, "centre": 1.5, "poses": 2.5,
-    "grid": 1.5, "fence": 3.0, "obstacles": 3.0, "stop": 2.0,
-}  # fmt: skip
 _GRID_LIGHT, _GRID_DARK = ((236, 236, 236), (190, 190, 190)), ((40, 40, 46), (76, 76, 84))
 _CENTRE_IN_THE_DARK = (225, 225, 225)
 _TRAIL_STEP, _OLD_TRAIL_STEP = 0.05, 0.2
@@ -116,11 +98,10 @@ class Scene:
         self._robot, self._wheels = self._add_robot()
         empty, shades = np.zeros((1, 2, 3)), np.zeros((1, 2, 3), np.uint8)
         self._lines = {
-            name: add_lines(server, name, empty, LAYER_COLOURS[name], _WIDTH_PX[name])
-            for name in ("points", "plan", "ellipse", "centre", "poses", "fence", "obstacles", "stop")
+            name: add_lines(server, name, empty, shades if name in ("trail", "fan") else layer.colour, layer.width_px)
+            for name, layer in LAYERS.items()
+            if name not in ("task", "robot")
         }
-        self._trail = add_lines(server, "trail", empty, shades, _WIDTH_PX["trail"])
-        self._fan = add_lines(server, "fan", empty, shades, _WIDTH_PX["fan"])
         self._shown_fan: tuple[records.Fan, tuple[float, ...]] | None = None
 
     def show(self, snapshot: Snapshot, everything: bool = True) -> None:
@@ -162,11 +143,13 @@ class Scene:
         scene.add_light_ambient("/ambient", intensity=1.6)
         cells, sections = grid_lines(course.middle_m, size_m, 0.1 if size_m <= 4.0 else 0.5)
         self._grid = [
-            add_lines(self._server, name, lines, colour, _WIDTH_PX["grid"], visible=True)
+            add_lines(self._server, name, lines, colour, _GRID_PX, visible=True)
             for name, lines, colour in zip(("cells", "ground"), (cells, sections), _GRID_LIGHT, strict=True)
         ]
         self._shaded = LIGHT
-        self._task = add_lines(self._server, "task", _line(task), TASK_COLOUR, _WIDTH_PX["task"], visible=True)
+        self._task = add_lines(
+            self._server, "task", _line(task), LAYERS["task"].colour, LAYERS["task"].width_px, visible=True
+        )
         self._shown_task = task
         camera = self._server.initial_camera
         camera.position, camera.look_at = first_camera(task)
@@ -177,7 +160,7 @@ class Scene:
         robot = scene.add_frame("/robot", show_axes=False, visible=False)
         scene.add_box(
             "/robot/body",
-            color=BODY_COLOUR,
+            color=LAYERS["robot"].colour,
             cast_shadow=False,
             dimensions=(1.25 * length, 0.75 * width, radius),
             position=(0.0, 0.0, 1.5 * radius),
@@ -199,7 +182,7 @@ class Scene:
                     f"{name}/tyre",
                     radius=radius,
                     height=0.6 * radius,
-                    color=WHEEL_COLOUR,
+                    color=_WHEEL_COLOUR,
                     cast_shadow=False,
                     wxyz=(math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0),
                 )
@@ -212,11 +195,13 @@ class Scene:
                 wheels.append(wheel)
         return robot, wheels
 
-    def _draw(self, layer: str, lines: Array) -> None:
-        """Replace the lines of a layer; hide it if it is off or has none."""
+    def _draw(self, layer: str, lines: Array, colours: Bytes | None = None) -> None:
+        """Replace the lines of a layer, and the colours (N, 2, 3) of their ends; hide it if it is off or has none."""
         node = self._lines[layer]
         if self.layers[layer] and len(lines):
             node.points = lines.astype(np.float32)
+            if colours is not None:
+                node.colors = colours
             node.visible = True
         elif node.visible:
             node.visible = False
@@ -228,7 +213,7 @@ class Scene:
             colours = _GRID_DARK if self.background == DARK else _GRID_LIGHT
             for lines, colour in zip(self._grid, colours, strict=True):
                 lines.colors = np.array(colour, np.uint8)
-            centre = _CENTRE_IN_THE_DARK if self.background == DARK else CENTRE_COLOUR
+            centre = _CENTRE_IN_THE_DARK if self.background == DARK else LAYERS["centre"].colour
             self._lines["centre"].colors = np.array(centre, np.uint8)
 
     def _draw_task(self, task: RobotTask) -> None:
@@ -240,38 +225,33 @@ class Scene:
         paths = np.empty((0, 0, 2))
         if fan is not None and self.layers["fan"]:
             paths = fan_paths(fan.weights, fan.x_m, fan.y_m)
-        if not len(paths):
+        if fan is None or not len(paths):
             self._shown_fan = None
-            if self._fan.visible:
-                self._fan.visible = False
+            self._draw("fan", _NO_LINES)
             return
-        if fan is None or (fan, self.background) == self._shown_fan:
+        if (fan, self.background) == self._shown_fan:
             return
-        colours = weight_colours(fan.weights, FAN_COLOUR, FAN_PALEST, self.background)
+        self._shown_fan = fan, self.background
+        colours = weight_colours(fan.weights, LAYERS["fan"].colour, FAN_PALEST, self.background)
         # The weightiest on top of the others.
         heights = np.linspace(*_FAN_M, len(paths))
         lines = [segments(path, height) for path, height in zip(paths, heights, strict=True)]
-        self._fan.points = np.concatenate(lines).astype(np.float32)
-        self._fan.colors = np.repeat(np.repeat(colours[:, None], paths.shape[1] - 1, axis=0), 2, axis=1)
-        self._fan.visible, self._shown_fan = True, (fan, self.background)
+        shades = np.repeat(np.repeat(colours[:, None], paths.shape[1] - 1, axis=0), 2, axis=1)
+        self._draw("fan", np.concatenate(lines), shades)
 
     def _draw_trail(self, snapshot: Snapshot) -> None:
-        visible = self.layers["trail"] and len(snapshot.trail) >= 2
-        if visible:
-            course = self._stage.task_at(snapshot.task).course()
-            trail = sparse(snapshot.trail, course.reach_m)
-            near = distance_colours(course.off_m(trail), TRAIL_FULL_M)
-            colours = faded(near, trail, _TRAIL_REACHES * course.reach_m, self.background)
-            points = segments(trail, _TRAIL_M)
-            self._trail.points = points.astype(np.float32)
-            self._trail.colors = np.stack((colours[:-1], colours[1:]), axis=1)
-            self._trail.visible = True
-        elif self._trail.visible:
-            self._trail.visible = False
+        if not self.layers["trail"] or len(snapshot.trail) < 2:
+            self._draw("trail", _NO_LINES)
+            return
+        course = self._stage.task_at(snapshot.task).course()
+        trail = sparse(snapshot.trail, course.reach_m)
+        near = distance_colours(course.off_m(trail), TRAIL_FULL_M)
+        colours = faded(near, trail, _TRAIL_REACHES * course.reach_m, self.background)
+        self._draw("trail", segments(trail, _TRAIL_M), np.stack((colours[:-1], colours[1:]), axis=1))
 
     def _ellipse(self, snapshot: Snapshot) -> Array:
         if snapshot.pose is None:
-            return np.empty((0, 2, 3))
+            return _NO_LINES
         points = ellipse_points(snapshot.pose[0], snapshot.pose[1], snapshot.covariance[:2, :2])
         return segments(points, 3.5 * self._wheel_radius)
 
@@ -283,20 +263,21 @@ class Scene:
                 snapshot.pose, snapshot.speed_m_s, snapshot.yaw_rate_rad_s, self._stage.x_icr_m, _CENTRE_LIMIT_M
             )
         if snapshot.pose is None or centre is None:
-            return np.empty((0, 2, 3))
+            return _NO_LINES
         ray = segments(np.array((snapshot.pose[:2], centre)), 0.01)
-        return np.concatenate((ray, _crosses(np.array((centre,)), 0.04, 0.01)))
+        cross = [_strokes(np.array((centre,)), np.array((0.04, across)), 0.01) for across in (0.04, -0.04)]
+        return np.concatenate((ray, *cross))
 
     def _points_paths(self, snapshot: Snapshot) -> Array:
         """Return the trajectories of the plan under the sigma points of the model's parameters."""
         if snapshot.plan is None or snapshot.pose is None or not self.layers["points"]:
-            return np.empty((0, 2, 3))
+            return _NO_LINES
         if snapshot.belief is not self._belief:
             self._points = ParameterPoints(model_in_force(self._stage.model, snapshot.belief))
             self._belief = snapshot.belief
         wheels = snapshot.wheel_speeds or (0.0, 0.0)
         paths = self._points.trajectories(snapshot.plan, wheels)
-        return np.concatenate([segments(path, _POINTS_M) for path in paths]) if len(paths) else np.empty((0, 2, 3))
+        return np.concatenate([segments(path, _POINTS_M) for path in paths]) if len(paths) else _NO_LINES
 
 
 def add_lines(
@@ -343,7 +324,7 @@ def sparse(trail: Array, reach_m: float) -> Array:
 
 def _outlines(lines: list[Array]) -> Array:
     """Join polylines (N, 2) on the floor into one array of line segments."""
-    return np.concatenate([segments(line, _FENCE_M) for line in lines]) if lines else np.empty((0, 2, 3))
+    return np.concatenate([segments(line, _FENCE_M) for line in lines]) if lines else _NO_LINES
 
 
 def _line(task: RobotTask) -> Array:
@@ -352,42 +333,28 @@ def _line(task: RobotTask) -> Array:
 
 def _pose_marks(poses: Array) -> Array:
     """Return a short stroke along the heading for each measured pose (N, 3); along x if the heading is NaN."""
-    if not len(poses):
-        return np.empty((0, 2, 3))
     poses = np.nan_to_num(poses, nan=0.0)
-    ahead = 0.03 * np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=1)
-    height = np.full((len(poses), 1), _POSES_M)
-    start, end = np.hstack((poses[:, :2] - ahead, height)), np.hstack((poses[:, :2] + ahead, height))
-    return np.stack((start, end), axis=1)
+    return _strokes(poses[:, :2], 0.03 * np.stack((np.cos(poses[:, 2]), np.sin(poses[:, 2])), axis=1), _POSES_M)
 
 
-def _crosses(points: Array, arm_m: float, height_m: float) -> Array:
-    """Two strokes for each point (N, 2)."""
-    height = np.full((len(points), 1), height_m)
-    strokes = []
-    for arm in (np.array((arm_m, arm_m)), np.array((arm_m, -arm_m))):
-        strokes.append(np.stack((np.hstack((points - arm, height)), np.hstack((points + arm, height))), axis=1))
-    return np.concatenate(strokes)
+def _strokes(points: Array, arms_m: Array, height_m: float) -> Array:
+    """Return a stroke through each point (N, 2), as long to either side as its arm (N, 2) or (2,), as (N, 2, 3)."""
+    ends = np.stack((points - arms_m, points + arms_m), axis=1)
+    return np.concatenate((ends, np.full((*ends.shape[:2], 1), height_m)), axis=-1)
 
 
 ELLIPSE_95 = 5.991464547107979
 """Squared Mahalanobis radius that holds 95 % of a Gaussian over the plane."""
 
 
-def circle_points(center_x_m: float, center_y_m: float, radius_m: float, count: int = 180) -> Array:
-    """Points (count + 1, 2) around a circle, the last on the first."""
-    angle = np.linspace(0.0, 2.0 * np.pi, count + 1)
-    return np.stack((center_x_m + radius_m * np.cos(angle), center_y_m + radius_m * np.sin(angle)), axis=1)
-
-
-def ellipse_points(x_m: float, y_m: float, covariance: Array, count: int = 48) -> Array:
-    """Points (count + 1, 2) on the 95 % ellipse of a position with this covariance (2, 2) m^2; (0, 2) if it is none."""
+def ellipse_points(x_m: float, y_m: float, covariance: Array) -> Array:
+    """Points (N, 2) on the 95 % ellipse of a position with this covariance (2, 2) m^2; (0, 2) if it is none."""
     if not np.all(np.isfinite(covariance)):
         return np.empty((0, 2))
     variances, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
     if variances[0] < 0.0:
         return np.empty((0, 2))
-    circle = circle_points(0.0, 0.0, math.sqrt(ELLIPSE_95), count)
+    circle = circle_outline(0.0, 0.0, math.sqrt(ELLIPSE_95))
     return np.asarray((circle * np.sqrt(variances)) @ axes.T + (x_m, y_m))
 
 

@@ -15,7 +15,7 @@ import io
 import logging
 import secrets
 import socket
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, redirect_stdout
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -70,12 +70,12 @@ class Guard:
     def refusal(self, path: str, headers: Headers, upgrade: bool) -> Response | None:
         """Return the answer to a request that must not go on, or None."""
         if not self.open:
-            return _plain(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being prepared; load it again")
+            return _respond(http.HTTPStatus.SERVICE_UNAVAILABLE, "the page is being prepared; load it again")
         host = headers.get("Host", "")
         if self.local and urlsplit(f"//{host}").hostname not in _LOOPBACK_NAMES:
-            return _plain(http.HTTPStatus.FORBIDDEN, "this page is for this machine only")
+            return _respond(http.HTTPStatus.FORBIDDEN, "this page is for this machine only")
         if upgrade and headers.get("Origin") not in {f"http://{host}", f"https://{host}"}:
-            return _plain(http.HTTPStatus.FORBIDDEN, "only this server's own page may connect")
+            return _respond(http.HTTPStatus.FORBIDDEN, "only this server's own page may connect")
         address = urlsplit(path)
         # Says nothing but which server this is, and is asked for under a name for which the browser has no cookie.
         if self._same(_cookie(headers, self._cookie_name)) or (address.path == _INSTANCE_PATH and not upgrade):
@@ -85,7 +85,7 @@ class Guard:
                 return None
             cookie = f"{self._cookie_name}={self.token}; HttpOnly; SameSite=Strict; Path=/"
             return _respond(http.HTTPStatus.SEE_OTHER, "welcome", {"Location": "/", "Set-Cookie": cookie})
-        return _plain(
+        return _respond(
             http.HTTPStatus.FORBIDDEN, "open the address with its token, as printed where the page was started"
         )
 
@@ -264,15 +264,18 @@ def _cookie(headers: Headers, name: str) -> str:
     return jar[name].value if name in jar else ""
 
 
-def _plain(status: http.HTTPStatus, text: str) -> Response:
-    return _respond(status, text, {})
-
-
-def _respond(status: http.HTTPStatus, text: str, extra: dict[str, str], page: bytes | None = None) -> Response:
+def _respond(
+    status: http.HTTPStatus, text: str, extra: Mapping[str, str] | None = None, page: bytes | None = None
+) -> Response:
     """Build a response with `extra` headers: the HTML `page` if given, otherwise `text` as plain text."""
     body = (text + "\n").encode() if page is None else page
     kind = "text/plain" if page is None else "text/html"
     headers = Headers(
-        {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body)), "Connection": "close", **extra}
+        {
+            "Content-Type": f"{kind}; charset=utf-8",
+            "Content-Length": str(len(body)),
+            "Connection": "close",
+            **(extra or {}),
+        }
     )
     return Response(status.value, status.phrase, headers, body)

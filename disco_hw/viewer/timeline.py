@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -117,13 +118,14 @@ class Items(Generic[Item]):
         self._items.clear()
 
 
-ESTIMATE = ("x_m", "y_m", "yaw_rad", "speed_m_s", "yaw_rate_rad_s", "wheels_healthy", "pose_healthy")
+# Columns are named as the fields of the records that they come from.
+ESTIMATE = ("x_m", "y_m", "yaw_rad", "speed_m_s", "yaw_rate_rad_s", "pose_healthy")
 COVARIANCE = tuple(f"cov{row}{column}" for row in range(3) for column in range(3))
 WHEELS = ("left_angle_rad", "right_angle_rad", "left_speed_rad_s", "right_speed_rad_s")
-COMMAND = ("requested_left_rad_s", "requested_right_rad_s", "left_rad_s", "right_rad_s", "in_force")
+COMMAND = ("left_rad_s", "right_rad_s", "in_force")
 POSE = ("x_m", "y_m", "yaw_rad")
 INNOVATION = ("x_m", "y_m", "yaw_rad", "variance_x", "variance_y", "variance_yaw", "test_ratio", "accepted")
-PLANNER = ("effective_samples", "temperature", "min_cost", "mean_cost")
+PLANNER = ("effective_samples", "temperature")
 LOOP = ("lateness_ns", "overruns", "skipped")
 POWER = ("voltage_v", "current_a", "temperature_c")
 
@@ -155,6 +157,21 @@ class Timeline:
         self.adaptations: Items[records.Adaptation] = Items()
         self.guards: Items[records.GuardVerdict] = Items()
         self.fences: Items[records.FenceChange] = Items()
+        estimate_of, planner_of = attrgetter(*ESTIMATE), attrgetter(*PLANNER)
+        self._rows: dict[type, tuple[Series, Callable[[Any], tuple[float, ...]]]] = {
+            records.Estimate: (self.estimate, lambda it: (*estimate_of(it), *it.covariance)),
+            WheelSample: (self.wheels, attrgetter(*WHEELS)),
+            records.Command: (self.command, attrgetter(*COMMAND)),
+            PoseSample: (self.pose, attrgetter(*POSE)),
+            records.Innovation: (
+                self.innovation,
+                lambda it: (*it.innovation, *it.variance, it.test_ratio, it.accepted),
+            ),
+            records.Plan: (self.planner, planner_of),
+            records.PlanFigures: (self.planner, planner_of),
+            records.LoopTiming: (self.loop, attrgetter(*LOOP)),
+            PowerSample: (self.power, attrgetter(*POWER)),
+        }
         self._as_they_are: dict[type, Items[Any]] = {
             RobotStatus: self.status, RobotLinkHealth: self.link, records.DaemonState: self.state,
             records.Event: self.events, records.Counters: self.counters, records.Fan: self.fans,
@@ -162,36 +179,19 @@ class Timeline:
             records.FenceChange: self.fences,
         }  # fmt: skip
 
-    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:  # noqa: PLR0912
+    def add(self, now_ns: int, record: records.Record | records.PlanFigures) -> None:
         """Take in one record of the tick at `now_ns`; ticks come in order. Frames are not kept."""
         self.first_ns = now_ns if self.first_ns is None else self.first_ns
         self.last_ns = now_ns
+        if type(record) in self._rows:
+            series, row_of = self._rows[type(record)]
+            series.append(now_ns, row_of(record))
         match record:
-            case records.Estimate() as it:
-                healthy = (float(it.wheels_healthy), float(it.pose_healthy))
-                motion = (it.x_m, it.y_m, it.yaw_rad, it.speed_m_s, it.yaw_rate_rad_s)
-                self.estimate.append(now_ns, (*motion, *healthy, *it.covariance))
-            case WheelSample() as it:
-                angles = (it.left_angle_rad, it.right_angle_rad)
-                self.wheels.append(now_ns, (*angles, it.left_speed_rad_s, it.right_speed_rad_s))
             case records.Command() as it:
-                requested = (it.requested_left_rad_s, it.requested_right_rad_s)
-                self.command.append(now_ns, (*requested, it.left_rad_s, it.right_rad_s, float(it.in_force)))
                 if self.source.last(now_ns) != it.source:
                     self.source.append(now_ns, it.source)
-            case records.LoopTiming() as it:
-                self.loop.append(now_ns, (float(it.lateness_ns), float(it.overruns), float(it.skipped)))
-            case records.Plan() | records.PlanFigures() as it:
-                self.planner.append(now_ns, (it.effective_samples, it.temperature, it.min_cost, it.mean_cost))
-                if isinstance(it, records.Plan):
-                    self.plans.append(now_ns, it)
-            case PoseSample() as it:
-                self.pose.append(now_ns, (it.x_m, it.y_m, it.yaw_rad))
-            case records.Innovation() as it:
-                row = (*it.innovation, *it.variance, it.test_ratio, float(it.accepted))
-                self.innovation.append(now_ns, row)
-            case PowerSample() as it:
-                self.power.append(now_ns, (it.voltage_v, it.current_a, it.temperature_c))
+            case records.Plan() as it:
+                self.plans.append(now_ns, it)
             case records.GuardVerdict() as it:
                 # Those between two that hold a path would hide it.
                 if it.path_x_m or it.obstacles or it.reason:
@@ -201,9 +201,7 @@ class Timeline:
 
     def drop_before(self, oldest_ns: int) -> None:
         """Drop what is older, so that a page that stays open does not grow."""
-        for series in (
-            self.estimate, self.wheels, self.command, self.pose, self.innovation, self.planner, self.loop, self.power
-        ):  # fmt: skip
+        for series, _ in self._rows.values():
             series.drop_before(oldest_ns)
         others: tuple[Items[Any], ...] = (self.plans, self.source, self.guards)
         for items in (*others, *self._as_they_are.values()):

@@ -12,7 +12,7 @@ import viser
 
 from disco_hw.runtime.robot_setup import with_values
 from disco_hw.tasks import RobotTask
-from disco_hw.viewer.scene import DARK, LAYER_COLOURS, LAYERS, LIGHT, Point, Scene, first_camera, segments
+from disco_hw.viewer.scene import DARK, LAYERS, LIGHT, Point, Scene, first_camera, segments
 
 # Chosen: as of what may be driven.
 DRAFT_COLOUR = (0, 150, 60)
@@ -95,8 +95,8 @@ def add_layers(server: viser.ViserServer, scene: Scene, changed: Callable[[], No
     gui = server.gui
     with gui.add_folder("Legend and layers", expand_by_default=False):
         gui.add_html(legend())
-        for name, label in LAYERS.items():
-            box = gui.add_checkbox(label, scene.layers[name])
+        for name, layer in LAYERS.items():
+            box = gui.add_checkbox(layer.label, scene.layers[name])
 
             @box.on_update
             def _(event: Any, name: str = name) -> None:
@@ -118,8 +118,8 @@ def legend() -> str:
     rows = [
         f'<div><span aria-hidden="true" style="display:inline-block;width:1.6em;height:0.5em;margin-right:0.6em;'
         f"border:1px solid #8888;"
-        f'background:rgb{colour}"></span>{html.escape(LAYERS[name])}</div>'
-        for name, colour in LAYER_COLOURS.items()
+        f'background:rgb{layer.colour}"></span>{html.escape(layer.label)}</div>'
+        for layer in LAYERS.values()
     ]
     note = "<div>the trail fades; purple on the task, teal 0.05 m, yellow 0.1 m beside it and beyond</div>"
     return f'<div style="font-size:0.85em;padding:0 0.8em 0.4em">{"".join(rows)}{note}</div>'

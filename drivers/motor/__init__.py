@@ -195,21 +195,14 @@ class RewiredDriver:
 
     def _wheels(self, sample: WheelSample) -> WheelSample:
         wiring = self._wiring
-        left, right = (
-            (sample.left_angle_rad, sample.left_speed_rad_s),
-            (sample.right_angle_rad, sample.right_speed_rad_s),
-        )
+        angles = [sample.left_angle_rad, sample.right_angle_rad]
+        speeds = [sample.left_speed_rad_s, sample.right_speed_rad_s]
         if wiring.sides_swapped != wiring.encoders_swapped:
-            left, right = right, left
-        on_left, on_right = (wiring.turn_ratio * direction for direction in wiring.encoder_direction)
-        return WheelSample(
-            sample.t_ns,
-            sample.received_ns,
-            on_left * left[0],
-            on_right * right[0],
-            on_left * left[1],
-            on_right * right[1],
-        )
+            angles.reverse()
+            speeds.reverse()
+        left, right = (wiring.turn_ratio * direction for direction in wiring.encoder_direction)
+        turned = (left * angles[0], right * angles[1], left * speeds[0], right * speeds[1])
+        return WheelSample(sample.t_ns, sample.received_ns, *turned)
 
     def _motors(self, sample: MotorSample) -> MotorSample:
         if not self._wiring.sides_swapped:

@@ -9,19 +9,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.motor import agilex_protocol as protocol
-from drivers.motor import vendor_parts as parts
-from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings, is_stationary, stop_frames
+from drivers.motor.agilex_protocol import TIMEOUT_S, AgilexSettings
+from drivers.motor.body_port import BodyPort
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
-    IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
-    BodyPort,
     FrameReport,
     Objection,
     Pending,
     Source,
-    Table,
     VendorDriver,
     stop_confirmation,
 )
@@ -29,7 +26,6 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
-    Limits,
     MotorDriver,
     ReceivedFrame,
     Request,
@@ -39,29 +35,25 @@ from drivers.types import (
 # The base sends its state at 10 Hz and its motion at 50 Hz: three and five messages. Gone: longer than a disturbance of
 # the bus.
 STATE_SILENT_NS, MOTION_SILENT_NS, GONE_NS = 350_000_000, 100_000_000, 1_000_000_000
+# Chosen: some steps of 0.001 on the wire, so that noise does not keep a base that stands from standing by.
+_STATIONARY_M_S, _STATIONARY_RAD_S = 0.01, 0.02
 _WARNINGS = 0x0606
 """Bits of the error word that only warn, in the SDK's byte and in the manual's: battery low, remote control lost."""
 _MODES = {protocol.STANDBY: "standby", protocol.UART_MODE: "serial mode", protocol.RC_MODE: "remote control"}
 _HOST_COMMANDS = frozenset({protocol.MOTION_COMMAND, protocol.CONTROL_MODE, protocol.STATE_RESET, protocol.BRAKE})
 
 
-class AgilexPort(BodyPort):
+class _AgilexPort(BodyPort):
     """Port of `VendorDriver` for AgileX bases."""
 
     settings: AgilexSettings
 
     def __init__(self, settings: AgilexSettings) -> None:
-        self.settings = settings
-        self.table = Table(
-            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2, watchdog_s=TIMEOUT_S, zeros_to_arm=5
-        )
-        self._driven_mm = (parts.Odometer(), parts.Odometer())
-        self.reset_state(0)
+        super().__init__(settings, TIMEOUT_S, Limit(TIMEOUT_S, "fixed"))
 
     @property
     def seen(self) -> Controllers:
-        """State of the base, as received last."""
-        is_complete = None not in (self._state_ns, self._motion_ns, self._driven_mm[0].last)
+        is_complete = None not in (self._state_ns, self._motion_ns, self._turned[0].last)
         faulty = self._vehicle == protocol.EXCEPTION or bool(self._error & ~_WARNINGS)
         text = f"the base reports an error ({self._error:#06x}); its manual's table of faults names it"
         driven = "an operator drives it by remote control; switch that off to drive it from here"
@@ -81,15 +73,6 @@ class AgilexPort(BodyPort):
         return None if self._state_ns is None else Identity("AgileX base, CAN v2", "", "robot.toml")
 
     @property
-    def limits(self) -> Limits:
-        """Limits that robot.toml declares of the base, and the time-out that all of them have."""
-        return parts.limits(
-            Limit(self.settings.fastest_rad_s, "robot.toml"),
-            Limit(TIMEOUT_S, "fixed"),
-            self.table.stop_deceleration_rad_s2,
-        )
-
-    @property
     def is_stopped(self) -> bool:
         """Whether the base stands in a mode that CAN cannot drive, or one of its buttons is pressed."""
         if self._state_ns is None or self._motion_ns is None:
@@ -98,25 +81,24 @@ class AgilexPort(BodyPort):
         return standing_by or self._vehicle == protocol.EMERGENCY_STOP
 
     def reset_state(self, now_ns: int) -> None:
-        """Forget the base's state."""
+        super().reset_state(now_ns)
         self._state_ns: int | None = None
         self._motion_ns: int | None = None
         self._vehicle, self._mode, self._error = protocol.NORMAL, protocol.STANDBY, 0
-        self._is_still = True
         self._speed = (0.0, 0.0)
-        for side in self._driven_mm:
-            side.reset_state()
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a frame of the base, or of another host."""
         frame = received.frame
         if not frame.extended and frame.can_id in _HOST_COMMANDS:
-            if frame not in stop_frames(self.settings):
+            if frame not in self.stop_frames():
                 return FrameReport(counts=("unknown_id",), commanded="the base")
             return FrameReport(counts=("unknown_id",), is_stop=frame.can_id == protocol.CONTROL_MODE)
         decoded = protocol.decode(frame)
         if decoded is None:
-            return REJECTED_LENGTH if frame.can_id in protocol.LAYOUTS and not frame.extended else UNKNOWN
+            if frame.extended or frame.can_id not in protocol.LAYOUTS.keys() | protocol.IGNORED:
+                return UNKNOWN
+            is_ignored = frame.can_id in protocol.IGNORED and len(frame.data) == 8
+            return FrameReport() if is_ignored else REJECTED_LENGTH
         values = decoded.values
         match decoded.name:
             case "system_state":
@@ -124,15 +106,15 @@ class AgilexPort(BodyPort):
                 self._error, self._state_ns = int(values["error_code"]), received.t_ns
                 return FrameReport(is_status=True)
             case "motion_state":
-                self._motion_ns, self._is_still = received.t_ns, is_stationary(decoded)
+                self._motion_ns = received.t_ns
                 self._speed = (float(values["linear_m_s"]), float(values["angular_rad_s"]))
             case "odometry":
                 counts = (int(values["left_mm"]), int(values["right_mm"]))
-                return self._handle_odometry(counts, received.t_ns, permit.looked_ns)
+                fastest = 1.5e3 * self.settings.max_speed_m_s
+                return self._handle_counts(counts, received.t_ns, permit.looked_ns, fastest, 10.0)
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: the base's state and its motion."""
         return (
             Source("the base", self._state_ns, STATE_SILENT_NS, GONE_NS),
             Source("the base's motion", self._motion_ns, MOTION_SILENT_NS),
@@ -169,12 +151,13 @@ class AgilexPort(BodyPort):
         return (protocol.clear_errors(),) if clears else self.stop_frames()
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Return the frames that command zero and standby."""
-        return stop_frames(self.settings)
+        """Return the frames for zero and standby, because the base has no e-stop by frame."""
+        return protocol.motion(0.0, 0.0), protocol.control_mode(protocol.STANDBY)
 
     @property
     def _is_stationary(self) -> bool:
-        return self._is_still
+        linear, angular = self._speed
+        return abs(linear) < _STATIONARY_M_S and abs(angular) < _STATIONARY_RAD_S
 
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return protocol.motion(linear_m_s, angular_rad_s)
@@ -182,35 +165,26 @@ class AgilexPort(BodyPort):
     def _standby_frames(self) -> tuple[Frame, ...]:
         return self.stop_frames()
 
-    def _handle_odometry(self, counts_mm: tuple[int, int], t_ns: int, looked_ns: int) -> FrameReport:
-        fastest = 1.5e3 * self.settings.max_speed_m_s
-        plausible = [
-            side.add_wrapping(count, t_ns, looked_ns, fastest, 10.0)
-            for side, count in zip(self._driven_mm, counts_mm, strict=True)
-        ]
-        wheels = None if self._motion_ns is None else self._sample(t_ns)
-        if all(plausible):
-            return FrameReport(wheels=wheels)
-        return FrameReport(counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: its odometry jumped")
-
-    def _sample(self, t_ns: int) -> WheelSample:
+    def _sample(self, t_ns: int) -> WheelSample | None:
+        if self._motion_ns is None:
+            return None
         radius, track = self.settings.wheel_radius_m, self.settings.track_m
         linear, angular = self._speed
-        left, right = (1e-3 * side.total / radius for side in self._driven_mm)
+        left, right = (1e-3 * side.total / radius for side in self._turned)
         speeds = (linear - 0.5 * track * angular, linear + 0.5 * track * angular)
         return WheelSample(t_ns, t_ns, left, right, speeds[0] / radius, speeds[1] / radius)
 
 
 DRIVER = MotorDriver(
     "agilex",
-    lambda settings, _key: VendorDriver(AgilexPort(settings)),
+    lambda settings, _key: VendorDriver(_AgilexPort(settings)),
     settings=AgilexSettings,
     takes_body_speeds=True,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
     latches_stop=False,
-    stop_frames=stop_frames,
-    stop_confirmation=lambda settings: stop_confirmation(AgilexPort(settings)),
+    stop_frames=lambda settings: _AgilexPort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_AgilexPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

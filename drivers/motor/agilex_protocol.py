@@ -9,52 +9,35 @@ What robot.toml says of a base follows the frames, with e-stop, bus load and saf
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Any
 
-from msgspec import Meta
-
-from drivers.motor.vendor_parts import BodySettings, Decoded, Layout, layout
+from drivers.motor.body_port import BodySettings
+from drivers.motor.vendor_parts import Decoded, by_number, layouts
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Identifiers of protocol v2 (ugv_sdk).
 MOTION_COMMAND, LIGHT_COMMAND, BRAKE, CONTROL_MODE, STATE_RESET = 0x111, 0x121, 0x131, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, LIGHT_STATE, RC_STATE, ODOMETRY = 0x211, 0x221, 0x231, 0x241, 0x311
-VERSION, MOTOR_SPEED = 0x4A1, 0x281
+VERSION, MOTOR_SPEED, BATTERY = 0x4A1, 0x281, (0x361, 0x362)
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
 NORMAL, EMERGENCY_STOP, EXCEPTION = range(3)
 # Speeds are 16-bit integers on the wire.
 _I16 = (-32768, 32767)
 
 
-_MOTION = "linear_m_s:1000 angular_rad_s:1000 lateral_m_s:1000 steering_rad:1000"
-_LIGHT = "enable front_mode front_value rear_mode rear_value"
-LAYOUTS: Mapping[int, Layout] = MappingProxyType(
-    {
-        row[1]: layout(">", *row)
-        for row in (
-            ("motion_command", MOTION_COMMAND, "hhhh", _MOTION),
-            ("light_command", LIGHT_COMMAND, "BBBBBxxx", _LIGHT),
-            ("control_mode_config", CONTROL_MODE, "B", "mode"),
-            ("state_reset", STATE_RESET, "B", "error_clear_byte"),
-            ("system_state", SYSTEM_STATE, "BBhHxx", "vehicle_state control_mode battery_v:10 error_code"),
-            ("motion_state", MOTION_STATE, "hhhh", _MOTION),
-            ("light_state", LIGHT_STATE, "BBBBBxxx", _LIGHT),
-            ("rc_state", RC_STATE, "Bbbbbbxx", "switches stick_right_h stick_right_v stick_left_v stick_left_h var_a"),
-            ("odometry", ODOMETRY, "ii", "left_mm right_mm"),
-            ("bms_basic", 0x361, "BBHhh", "soc_percent soh_percent bms_v:10 bms_a:10 bms_deg_c:10"),
-            ("bms_extended", 0x362, "BBBB4x", "alarm_1 alarm_2 warn_1 warn_2"),
-            ("motor_speed", MOTOR_SPEED, "hhhh", "m1_m_s:1000 m2_m_s:1000 m3_m_s:1000 m4_m_s:1000"),
-            ("version_response", VERSION, "8s", "bytes"),
-            *(("actuator_high_speed", 0x251 + motor, "hhi", "rpm current_a:10 pulses") for motor in range(8)),
-            *(
-                ("actuator_low_speed", 0x261 + motor, "HhbBxx", "driver_v:10 driver_deg_c motor_deg_c driver_state")
-                for motor in range(8)
-            ),
-        )
-    }
+LAYOUTS = by_number(
+    layouts(
+        ">",
+        ("system_state", SYSTEM_STATE, "BBhHxx", "vehicle_state control_mode battery_v:10 error_code"),
+        ("motion_state", MOTION_STATE, "hhhh", "linear_m_s:1000 angular_rad_s:1000 lateral_m_s:1000 steering_rad:1000"),
+        ("odometry", ODOMETRY, "ii", "left_mm right_mm"),
+    )
 )
+IGNORED = frozenset(
+    {LIGHT_COMMAND, LIGHT_STATE, RC_STATE, VERSION, MOTOR_SPEED, *BATTERY, *range(0x251, 0x259), *range(0x261, 0x269)}
+)
+"""Messages of 8 bytes that say nothing to the driver; the last two of each motor: its speed, and its temperatures."""
 
 
 def motion(linear_m_s: float, angular_rad_s: float) -> Frame:
@@ -69,32 +52,23 @@ def control_mode(mode: int) -> Frame:
     return Frame(CONTROL_MODE, bytes([mode]).ljust(8, b"\0"))
 
 
-def clear_errors(which: int = 0) -> Frame:
-    """Clear all errors (0) or those of motor 1 to 4."""
-    return Frame(STATE_RESET, bytes([which]))
+def clear_errors() -> Frame:
+    """Clear the errors of the base and of all motors."""
+    return Frame(STATE_RESET, b"\0")
 
 
 def decode(frame: Frame) -> Decoded | None:
-    """Return what a frame says; None for an unknown one, and for one not of its full length.
-
-    CONTROL_MODE and STATE_RESET may have 1 or 8 bytes: the manual and the SDK disagree.
-    """
+    """Return what a base says; None for another message than those of `LAYOUTS`, or not of its full length."""
     found = LAYOUTS.get(frame.can_id)
-    if frame.extended or found is None:
+    if frame.extended or found is None or len(frame.data) != found.length:
         return None
-    if len(frame.data) != found.length and not (found.length == 1 and len(frame.data) == 8):
-        return None
-    # The messages of a motor, counted from 0.
-    motor = (frame.can_id & 0xF) - 1 if frame.can_id >> 4 in (0x25, 0x26) else -1
-    return Decoded(found.name, found.unpack(frame.data), motor)
+    return Decoded(found.name, found.unpack(frame.data))
 
 
 # By the manual; the base offers no way to change or read it.
 TIMEOUT_S = 0.5
 # Chosen: so many frames of both kinds are no chance on a bus of another vendor.
 _RECEIVED = 3
-# Chosen: some steps of 0.001 on the wire, so that noise does not keep a base that stands from standing by.
-STATIONARY_M_S, STATIONARY_RAD_S = 0.01, 0.02
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31
 max_speed_m_s = 1.5
@@ -104,22 +78,9 @@ max_speed_m_s = 1.5
 class AgilexSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back."""
 
-    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
-
     def fault(self) -> SettingsFault | None:
         """Return None, because each field shows its own faults."""
         return None
-
-
-def stop_frames(_settings: AgilexSettings) -> tuple[Frame, ...]:
-    """Return the frames for zero and standby, because the base has no e-stop by frame."""
-    return motion(0.0, 0.0), control_mode(STANDBY)
-
-
-def is_stationary(motion: Decoded) -> bool:
-    """Whether the base says that it does not move."""
-    speed, turn = motion.values["linear_m_s"], motion.values["angular_rad_s"]
-    return abs(float(speed)) < STATIONARY_M_S and abs(float(turn)) < STATIONARY_RAD_S
 
 
 def cyclic_frames(_settings: AgilexSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

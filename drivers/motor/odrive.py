@@ -17,11 +17,8 @@ from drivers.motor.odrive_protocol import (
     ESTOP_ERROR,
     WATCHDOG_ERROR,
     AxisState,
-    Generation,
     OdriveSettings,
     Questions,
-    error_text,
-    stop_frames,
 )
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
@@ -74,13 +71,12 @@ class _Axis:
     turned: parts.Odometer = field(default_factory=parts.Odometer)
 
 
-class OdrivePort(Port):
+class _OdrivePort(Port):
     """Port of `VendorDriver` for ODrive boards. Asks nothing but at rest: it would feed the watchdogs."""
 
     def __init__(self, settings: OdriveSettings) -> None:
         self._settings = settings
         self.table = Table(stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2)
-        self._generation = settings.generation
         self._sides = [[_Axis(node) for node in side] for side in parts.sides_of(settings.nodes)]
         self._axes = {axis.node: axis for side in self._sides for axis in side}
         self._questions = Questions(settings)
@@ -88,10 +84,9 @@ class OdrivePort(Port):
 
     @property
     def seen(self) -> Controllers:
-        """State of the axes, as received last."""
         silent = ", ".join(str(axis.node) for axis in self._all if axis.received_ns is None)
         unheard = f"no heartbeat of node {silent}; check that it is switched on and has this bit rate and this id"
-        stopped = any(axis.error & ESTOP_ERROR[self._generation] for axis in self._all)
+        stopped = any(axis.error & ESTOP_ERROR[self._settings.firmware] for axis in self._all)
         faulty = [axis for axis in self._all if axis.error and not self._is_idle_watchdog(axis)]
         return Controllers(
             missing=None if self._questions.known else unheard if silent else "requesting the version of the nodes",
@@ -124,11 +119,10 @@ class OdrivePort(Port):
     @property
     def is_stopped(self) -> bool:
         """Whether every axis has the error of an e-stop and lets its motor go, which is a control cycle later."""
-        estop = ESTOP_ERROR[self._generation]
+        estop = ESTOP_ERROR[self._settings.firmware]
         return all(axis.error & estop and axis.state != AxisState.CLOSED_LOOP for axis in self._all)
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the axes reported."""
         self._questions.reset_state(now_ns)
         for axis in self._all:
             axis.received_ns = None
@@ -136,14 +130,13 @@ class OdrivePort(Port):
             axis.turned.reset_state()
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a frame of an axis, or of another host."""
         frame, t_ns = received.frame, received.t_ns
         if self._questions.handle_parameter(frame):
             return FrameReport(message=self._questions.new_messages())
-        decoded = protocol.decode(self._generation, frame)
-        if decoded is None and self._generation is Generation.V05:
+        decoded = protocol.decode(self._settings.firmware, frame)
+        if decoded is None and self._settings.firmware == "0.5":
             # What 0.5 never sends: an answer for the version.
-            decoded = protocol.decode(Generation.V06, frame)
+            decoded = protocol.decode("0.6", frame)
             decoded = decoded if decoded is not None and decoded.name == "Get_Version" else None
         if decoded is None or decoded.node not in self._axes:
             return self._unused(frame)
@@ -159,7 +152,6 @@ class OdrivePort(Port):
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: the heartbeats of every axis."""
         silent_ns = max(SILENT_BEATS * self._settings.heartbeat_s * 1e9, SILENT_AT_LEAST_NS)
         gone_ns = max(2.0 * silent_ns, 5e8)
         return [Source(f"node {axis.node}", axis.received_ns, silent_ns, gone_ns) for axis in self._all]
@@ -202,7 +194,6 @@ class OdrivePort(Port):
         return Pending(why=why, frames=tuple(frames))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frames that command the velocity of each axis."""
         limit = self._settings.vel_limit_turns_s
         frames = []
         for side, direction, speed in zip(
@@ -212,7 +203,7 @@ class OdrivePort(Port):
             # Adding zero takes the sign off a zero.
             turns = min(max(turns, -limit), limit) + 0.0
             frames += [
-                protocol.encode(self._generation, axis.node, "Set_Input_Vel", vel_turns_s=turns, torque_nm=0.0)
+                protocol.encode(self._settings.firmware, axis.node, "Set_Input_Vel", vel_turns_s=turns, torque_nm=0.0)
                 for axis in side
             ]
         return frames
@@ -236,8 +227,8 @@ class OdrivePort(Port):
         return bool(is_cleared and self._may_be_cleared) and not any(axis.error for axis in self._all)
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Return the e-stop frames to every axis."""
-        return stop_frames(self._settings)
+        """Return the e-stop to every axis: it idles with an error that stays until it is cleared."""
+        return tuple(self._each("Estop"))
 
     @property
     def _all(self) -> Sequence[_Axis]:
@@ -253,7 +244,7 @@ class OdrivePort(Port):
 
     def _is_idle_watchdog(self, axis: _Axis) -> bool:
         """Whether its watchdog has run out while nobody drove it, which is no fault."""
-        return axis.state == AxisState.IDLE and axis.error == WATCHDOG_ERROR[self._generation]
+        return axis.state == AxisState.IDLE and axis.error == WATCHDOG_ERROR[self._settings.firmware]
 
     @property
     def _why_unfit(self) -> str | None:
@@ -265,13 +256,13 @@ class OdrivePort(Port):
         return "a motor is turning; wait until it stands still" if fastest > _STATIONARY_RAD_S else None
 
     def _each(self, name: str, **values: int) -> list[Frame]:
-        return [protocol.encode(self._generation, axis.node, name, **values) for axis in self._all]
+        return [protocol.encode(self._settings.firmware, axis.node, name, **values) for axis in self._all]
 
     def _state_frames(self, state: AxisState) -> list[Frame]:
         return self._each("Set_Axis_State", state=int(state))
 
     def _clear_frames(self) -> list[Frame]:
-        return self._each("Clear_Errors", **({"identify": 0} if self._generation is Generation.V06 else {}))
+        return self._each("Clear_Errors", **({"identify": 0} if self._settings.firmware == "0.6" else {}))
 
     def _handle_heartbeat(self, axis: _Axis, values: Mapping[str, float], t_ns: int) -> FrameReport:
         state, error = int(values["axis_state"]), int(values["axis_error"])
@@ -315,17 +306,19 @@ class OdrivePort(Port):
         return UNKNOWN if len(frame.data) == 8 else REJECTED_LENGTH
 
     def _fault_text(self, axis: _Axis) -> str:
-        return error_text(self._generation, axis.error)
+        """Return the meaning of the bits of an axis' error as text."""
+        texts = [text for bit, text in protocol.ERRORS[self._settings.firmware].items() if axis.error & bit]
+        return "; ".join(texts) or f"error {axis.error:#x}"
 
 
 DRIVER = MotorDriver(
     "odrive",
-    lambda settings, _key: VendorDriver(OdrivePort(settings)),
+    lambda settings, _key: VendorDriver(_OdrivePort(settings)),
     settings=OdriveSettings,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
-    stop_frames=stop_frames,
-    stop_confirmation=lambda settings: stop_confirmation(OdrivePort(settings)),
+    stop_frames=lambda settings: _OdrivePort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_OdrivePort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

@@ -12,27 +12,21 @@ from __future__ import annotations
 import enum
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import Decoded, Layout, Nodes, Sign, all_of, by_number, in_sides, layouts, sides_of
+from drivers.motor.vendor_parts import Decoded, Layout, Nodes, Sign, all_of, by_number, in_sides, layouts, nodes_fault
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # CAN Simple: six bits of node, of which 0x3F is no axis, and five of command.
 LARGEST_NODE = 0x3E
 _NODE_SHIFT, _COMMAND_MASK = 5, 0x1F
 Value = float | int
-
-
-class Generation(enum.Enum):
-    """Generations of the firmware; 0.6 and later use the same protocol."""
-
-    V05 = "0.5"
-    V06 = "0.6"
+Firmware = Literal["0.5", "0.6"]
+"""Generations of the firmware; 0.6 and later use the same protocol."""
 
 
 class AxisState(enum.IntEnum):
@@ -52,34 +46,15 @@ _COMMON_COMMANDS = (
     ("Estop", 0x02, "", ""),
     ("Set_Axis_State", 0x07, "I4x", "state"),
     ("Set_Controller_Mode", 0x0B, "II", "control_mode input_mode"),
-    ("Set_Input_Pos", 0x0C, "fhh", "pos_turns vel_ff_milliturns_s torque_ff_mnm"),
     ("Set_Input_Vel", 0x0D, "ff", "vel_turns_s torque_nm"),
-    ("Set_Input_Torque", 0x0E, "f4x", "torque_nm"),
-    ("Set_Limits", 0x0F, "ff", "vel_limit_turns_s current_limit_a"),
-    ("Set_Traj_Vel_Limit", 0x11, "f4x", "vel_limit"),
-    ("Set_Traj_Accel_Limits", 0x12, "ff", "accel decel"),
-    ("Set_Pos_Gain", 0x1A, "f4x", "pos_gain"),
-    ("Set_Vel_Gains", 0x1B, "ff", "vel_gain vel_integrator_gain"),
 )
-COMMANDS: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
+COMMANDS: Mapping[Firmware, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: layouts(
-            "<",
-            *_COMMON_COMMANDS,
-            ("Set_Axis_Node_ID", 0x06, "I", "new_node_id"),
-            ("Clear_Errors", 0x18, "", ""),
-            ("Set_Linear_Count", 0x19, "i4x", "count"),
-        ),
-        Generation.V06: layouts(
-            "<",
-            *_COMMON_COMMANDS,
-            ("Reboot", 0x16, "B", "action"),
-            ("Clear_Errors", 0x18, "B", "identify"),
-            ("Set_Absolute_Position", 0x19, "f4x", "pos_turns"),
-        ),
+        "0.5": layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "", "")),
+        "0.6": layouts("<", *_COMMON_COMMANDS, ("Clear_Errors", 0x18, "B", "identify")),
     }
 )
-"""What a host may send. The driver uses Estop, Set_Axis_State, Set_Controller_Mode, Set_Input_Vel and Clear_Errors."""
+"""What the driver sends; a host may send more."""
 
 _VERSION_FIELDS = "protocol hw_major hw_minor hw_variant fw_major fw_minor fw_revision fw_unreleased"
 _COMMON_TELEMETRY = (
@@ -87,9 +62,9 @@ _COMMON_TELEMETRY = (
     ("Get_Iq", 0x14, "ff", "iq_setpoint_a iq_measured_a"),
     ("Get_Bus_Voltage_Current", 0x17, "ff", "bus_v bus_a"),
 )
-TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
+TELEMETRY: Mapping[Firmware, Mapping[str, Layout]] = MappingProxyType(
     {
-        Generation.V05: layouts(
+        "0.5": layouts(
             "<",
             *_COMMON_TELEMETRY,
             ("Heartbeat", 0x01, "IBBBB", "axis_error axis_state motor_flags encoder_flags controller_flags"),
@@ -100,7 +75,7 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
             ("Get_Sensorless_Estimates", 0x15, "ff", "sensorless_pos sensorless_vel"),
             ("Get_Controller_Error", 0x1D, "I4x", "controller_error"),
         ),
-        Generation.V06: layouts(
+        "0.6": layouts(
             "<",
             *_COMMON_TELEMETRY,
             ("Get_Version", 0x00, "8B", _VERSION_FIELDS),
@@ -114,7 +89,7 @@ TELEMETRY: Mapping[Generation, Mapping[str, Layout]] = MappingProxyType(
 )
 # Get_Version of CAN Simple in firmware 0.6; 0.5 has no such command.
 GET_VERSION = 0x00
-_BY_NUMBER = {generation: by_number(table) for generation, table in TELEMETRY.items()}
+_BY_NUMBER = {firmware: by_number(table) for firmware, table in TELEMETRY.items()}
 _SDO_VALUES = MappingProxyType({"f32": "f", "u32": "I", "i32": "i", "u16": "H", "u8": "B", "bool": "?"})
 _SDO_HEAD = struct.Struct("<BHB")
 # RxSdo and TxSdo of CAN Simple in firmware 0.6, as the node names them.
@@ -133,9 +108,9 @@ def split(can_id: int) -> tuple[int, int]:
     return can_id >> _NODE_SHIFT, can_id & _COMMAND_MASK
 
 
-def encode(generation: Generation, node: int, name: str, **values: Value) -> Frame:
+def encode(firmware: Firmware, node: int, name: str, **values: Value) -> Frame:
     """Return the frame of a command; `values` by the names of `COMMANDS`. Raises KeyError for one that is missing."""
-    layout = COMMANDS[generation][name]
+    layout = COMMANDS[firmware][name]
     data = layout.pack(*(values[field] for field in layout.fields))
     return Frame(identifier(node, layout.command), data)
 
@@ -145,14 +120,14 @@ def request_frame(node: int, command: int) -> Frame:
     return Frame(identifier(node, command), b"")
 
 
-def decode(generation: Generation, frame: Frame) -> Decoded | None:
+def decode(firmware: Firmware, frame: Frame) -> Decoded | None:
     """Return what a node says; None for what is no telemetry, or not of its full length."""
     node, command = split(frame.can_id)
-    known = _BY_NUMBER[generation].get(command)
+    known = _BY_NUMBER[firmware].get(command)
     if frame.extended or known is None or node > LARGEST_NODE or len(frame.data) != known.length:
         return None
     values = known.unpack(frame.data)
-    if generation is Generation.V06 and known.name == "Heartbeat":
+    if firmware == "0.6" and known.name == "Heartbeat":
         values["trajectory_done"] = int(values["trajectory_done"]) & 1
     return Decoded(known.name, values, node)
 
@@ -160,12 +135,6 @@ def decode(generation: Generation, frame: Frame) -> Decoded | None:
 def read_parameter(node: int, endpoint: int) -> Frame:
     """Return the request (0.6) for a parameter; its number is of that very firmware's flat_endpoints.json."""
     return Frame(identifier(node, SDO_REQUEST), _SDO_HEAD.pack(0, endpoint, 0) + bytes(4))
-
-
-def write_parameter(node: int, endpoint: int, kind: str, value: Value) -> Frame:
-    """Return the request (0.6) to set a parameter of a `kind` of "f32", "u32", "i32", "u16", "u8" or "bool"."""
-    body = struct.pack("<" + _SDO_VALUES[kind], value).ljust(4, b"\0")
-    return Frame(identifier(node, SDO_REQUEST), _SDO_HEAD.pack(1, endpoint, 0) + body)
 
 
 def parameter(frame: Frame, node: int, endpoint: int, kind: str) -> Value | None:
@@ -177,7 +146,7 @@ def parameter(frame: Frame, node: int, endpoint: int, kind: str) -> Value | None
     return value if replied == endpoint else None
 
 
-WATCHDOG_ERROR = {Generation.V05: 0x800, Generation.V06: 0x0100_0000}
+WATCHDOG_ERROR = {"0.5": 0x800, "0.6": 0x0100_0000}
 EXAMPLE = """nodes = [3, 5]
 direction = [1, -1]
 gear = 8.0
@@ -185,10 +154,10 @@ watchdog_s = 0.1
 vel_limit_turns_s = 15.0
 heartbeat_s = 0.02
 """
-ESTOP_ERROR = {Generation.V05: 0x4000, Generation.V06: 0x0200_0000}
-_ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
+ESTOP_ERROR = {"0.5": 0x4000, "0.6": 0x0200_0000}
+ERRORS: Mapping[Firmware, Mapping[int, str]] = MappingProxyType(
     {
-        Generation.V05: {
+        "0.5": {
             0x1: "invalid state: calibrate it with odrivetool first",
             0x40: "the motor failed; read its error with odrivetool",
             0x80: "the sensorless estimator failed",
@@ -200,7 +169,7 @@ _ERRORS: Mapping[Generation, Mapping[int, str]] = MappingProxyType(
             0x4000: "emergency stop",
             0x40000: "too hot; let it cool",
         },
-        Generation.V06: {
+        "0.6": {
             0x1: "still starting",
             0x4: "it missed its own control deadlines",
             0x8: "no position or velocity estimate; check the encoder",
@@ -238,43 +207,18 @@ class OdriveSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     nodes: tuple[Nodes, Nodes]
     watchdog_s: Annotated[float, Meta(gt=0.0, le=0.5)]
     vel_limit_turns_s: Annotated[float, Meta(gt=0.0, le=1000.0)]
-    firmware: Literal["0.5", "0.6"] = "0.6"
+    firmware: Firmware = "0.6"
     direction: tuple[Sign, Sign] = (1, 1)
     gear: Annotated[float, Meta(gt=0.0, le=1000.0)] = 1.0
     heartbeat_s: Annotated[float, Meta(ge=0.005, le=0.2)] = 0.1
     watchdog_endpoints: tuple[_Endpoint, _Endpoint] | None = None
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
-    @property
-    def generation(self) -> Generation:
-        """Generation of the firmware."""
-        return Generation(self.firmware)
-
     def fault(self) -> SettingsFault | None:
         """Return what is wrong with the fields taken together, or None."""
-        nodes = all_of(self.nodes)
-        if not all(sides_of(self.nodes)):
-            return SettingsFault("nodes", "a side has no node", "write [left, right], such as [3, 5]")
-        if any(not 0 <= node <= LARGEST_NODE for node in nodes):
-            return SettingsFault(
-                "nodes", f"a node is outside 0 to {LARGEST_NODE}", "write the ids that odrivetool shows"
-            )
         if self.watchdog_endpoints is not None and self.firmware != "0.6":
             return SettingsFault("watchdog_endpoints", "firmware 0.5 has none that CAN could read", "remove it")
-        if len(set(nodes)) != len(nodes):
-            return SettingsFault("nodes", "a node is listed twice", "write the id of each motor's own node")
-        return None
-
-
-def error_text(generation: Generation, error: int) -> str:
-    """Return the meaning of the bits of an axis' error as text."""
-    texts = [text for bit, text in _ERRORS[generation].items() if error & bit]
-    return "; ".join(texts) or f"error {error:#x}"
-
-
-def stop_frames(settings: OdriveSettings) -> tuple[Frame, ...]:
-    """Return the e-stop to every node: it idles with an error that stays until it is cleared."""
-    return tuple(encode(settings.generation, node, "Estop") for node in all_of(settings.nodes))
+        return nodes_fault(self.nodes, LARGEST_NODE)
 
 
 def cyclic_frames(settings: OdriveSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
@@ -294,7 +238,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
     None if there are none: heartbeats alone could be another vendor's frames.
     """
-    decoded = [one for frame in frames if (one := decode(Generation.V06, frame)) is not None]
+    decoded = [one for frame in frames if (one := decode("0.6", frame)) is not None]
     beats, estimates = (
         [one.node for one in decoded if one.name == name] for name in ("Heartbeat", "Get_Encoder_Estimates")
     )
@@ -338,14 +282,6 @@ _ALIVE_PERIOD_NS = 30_000_000
 _SAME_TIMEOUT_S = 0.002
 
 
-@dataclass(slots=True)
-class _Watchdog:
-    """Watchdog of a node, as far as the node has reported it."""
-
-    is_on: bool | None = None
-    timeout_s: float | None = None
-
-
 class Questions:
     """Questions to all nodes and their replies since the last start; pure.
 
@@ -366,7 +302,9 @@ class Questions:
         self.refusal: str | None = None
         self._message: str | None = None
         self._is_met = False
-        self._watchdogs = {node: _Watchdog() for node in self._nodes}
+        # Of the nodes that have reported their watchdog: whether it is on, and its timeout (s).
+        self._is_on: dict[int, bool] = {}
+        self._timeouts_s: dict[int, float] = {}
         self._version_tries = self._watchdog_tries = 0
         self._requested_ns = now_ns - _PERIOD_NS
 
@@ -384,13 +322,13 @@ class Questions:
             return []
         self._requested_ns = now_ns
         if waits:
-            number = TELEMETRY[self._settings.generation]["Get_Bus_Voltage_Current"].command
+            number = TELEMETRY[self._settings.firmware]["Get_Bus_Voltage_Current"].command
             return [request_frame(node, number) for node in self._nodes]
         return self._for_watchdogs() if self._is_met else self._for_version()
 
     def handle_version(self, values: Mapping[str, float]) -> None:
         """Handle a reply with the version."""
-        if self._settings.generation is Generation.V05:
+        if self._settings.firmware == "0.5":
             self.refusal = 'the nodes report their version, which firmware 0.5 does not; write link.firmware = "0.6"'
         elif not self._is_met:
             version = ".".join(str(values[f"fw_{part}"]) for part in ("major", "minor", "revision"))
@@ -399,22 +337,24 @@ class Questions:
     def handle_parameter(self, frame: Frame) -> bool:
         """Whether the frame answers for a watchdog, which is then judged."""
         node, _ = split(frame.can_id)
-        if node not in self._watchdogs or self._settings.watchdog_endpoints is None or not self._is_met:
+        if node not in self._nodes or self._settings.watchdog_endpoints is None or not self._is_met:
             return False
         enabled, timeout = self._settings.watchdog_endpoints
         is_on = parameter(frame, node, enabled, "bool")
         timeout_s = parameter(frame, node, timeout, "f32")
         if is_on is None and timeout_s is None:
             return False
-        watchdog = self._watchdogs[node]
-        watchdog.is_on = watchdog.is_on if is_on is None else bool(is_on)
-        watchdog.timeout_s = watchdog.timeout_s if timeout_s is None else float(timeout_s)
+        if is_on is not None:
+            self._is_on[node] = bool(is_on)
+        if timeout_s is not None:
+            self._timeouts_s[node] = float(timeout_s)
         configured_s = self._settings.watchdog_s
-        if watchdog.is_on is False:
+        found_s = self._timeouts_s.get(node, configured_s)
+        if not self._is_on.get(node, True):
             self.refusal = f"node {node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
-        elif watchdog.timeout_s is not None and not abs(watchdog.timeout_s - configured_s) <= _SAME_TIMEOUT_S:
-            self.refusal = f"node {node}: its watchdog is set to {watchdog.timeout_s:g} s; set it to {configured_s:g} s"
-        elif not self.known and all(one.is_on and one.timeout_s is not None for one in self._watchdogs.values()):
+        elif not abs(found_s - configured_s) <= _SAME_TIMEOUT_S:
+            self.refusal = f"node {node}: its watchdog is set to {found_s:g} s; set it to {configured_s:g} s"
+        elif not self.known and all(self._is_on.get(one) and one in self._timeouts_s for one in self._nodes):
             self._announce(f", watchdog {configured_s:g} s")
         return True
 
@@ -422,7 +362,7 @@ class Questions:
         self._version_tries += 1
         if self._version_tries <= VERSION_TRIES:
             return [request_frame(node, GET_VERSION) for node in self._nodes]
-        if self._settings.generation is Generation.V05:
+        if self._settings.firmware == "0.5":
             # That generation does not know the question.
             self._complete_handshake()
         else:
@@ -433,7 +373,7 @@ class Questions:
         """Return the questions until every node has reported whether its watchdog is on and how long it waits."""
         self._watchdog_tries += 1
         endpoints = self._settings.watchdog_endpoints or ()
-        waiting = [node for node, one in self._watchdogs.items() if one.is_on is None or one.timeout_s is None]
+        waiting = [node for node in self._nodes if node not in self._is_on or node not in self._timeouts_s]
         if self._watchdog_tries > WATCHDOG_TRIES:
             self.refusal = f"node {waiting[0]} does not report its watchdog; correct link.watchdog_endpoints"
             return []

@@ -130,10 +130,6 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
                 return seen.unfit or self.note
         return self.note
 
-    def may_arm(self, seen: Controllers) -> bool:
-        """Whether arming may be asked for."""
-        return self.state(seen) in (DriverState.STANDBY, DriverState.READY) and seen.unfit is None
-
     def is_late(self, now_ns: int, timeout_s: float) -> bool:
         """Whether controllers that hold a speed must have stopped by themselves, as nothing was commanded for so long.
 
@@ -161,7 +157,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
     def restarted(self, why: str, event: str | None = None) -> MotionPermit:
         """Return the permit for controllers that must be synchronised again; what is latched stays."""
         note = f"disarmed: {why}" if self.target is Request.ARM else self.note
-        permit_after = replace(self._idled(note), shared=False)
+        permit_after = replace(self.given_up(note), shared=False)
         return permit_after if event is None else permit_after.with_event(event)
 
     def requested(self, request: Request, seen: Controllers) -> MotionPermit:
@@ -172,7 +168,7 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         if request is self.target:
             return self
         if request is Request.ARM:
-            if not self.may_arm(seen):
+            if self.state(seen) not in (DriverState.STANDBY, DriverState.READY) or seen.unfit is not None:
                 return replace(self, note=f"not arming: {self.detail(seen)}")
             return replace(
                 self, target=request, stage=Stage.ARMING, since_ns=None, zeros=0, speeds=(0.0, 0.0), note="arming"
@@ -222,22 +218,18 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         stopping = self.stage in (Stage.STOPPING, Stage.BRAKING)
         return replace(self, stage=Stage.REST, since_ns=None) if stopping else self
 
-    def given_up(self, why: str) -> MotionPermit:
-        """Not armed, or disarmed, without a fault."""
-        return self._idled(why)
-
     def lost(self, why: str) -> MotionPermit:
         """One controller, or its host, is lost: all stop, and that stays a fault until a reset."""
-        stopped = replace(self._idled(f"disarmed: {why}"), stage=self.after_loss, fault=why)
+        stopped = replace(self.given_up(f"disarmed: {why}"), stage=self.after_loss, fault=why)
         return stopped.with_event(f"disarmed: {why}")
 
     def stopped(self) -> MotionPermit:
         """Return the permit after an emergency stop was sent from here."""
-        return replace(self._idled("emergency stop sent"), stage=self.after_loss, estopped=True)
+        return replace(self.given_up("emergency stop sent"), stage=self.after_loss, estopped=True)
 
     def stop_received(self) -> MotionPermit:
         """Return the permit after an emergency stop was received that somebody else sent; reported once."""
-        stopped = replace(self._idled(self.note), stage=self.after_loss, estopped=True)
+        stopped = replace(self.given_up(self.note), stage=self.after_loss, estopped=True)
         return stopped if self.estopped else stopped.with_event(STOPPED_FROM_OUTSIDE)
 
     def command_received(self, whom: str) -> MotionPermit:
@@ -263,5 +255,6 @@ class MotionPermit(msgspec.Struct, frozen=True, kw_only=True):
         """Return the permit with one more event for the operator."""
         return replace(self, events=(*self.events, event))
 
-    def _idled(self, note: str) -> MotionPermit:
+    def given_up(self, note: str) -> MotionPermit:
+        """Return the permit without a request: not armed, or disarmed, without a fault; `note` says why."""
         return replace(self, target=Request.STANDBY, stage=self.idle, since_ns=None, note=note)

@@ -5,7 +5,6 @@ Its parts lie beside it: frames and telemetry, arming and the watch over an arme
 
 from __future__ import annotations
 
-import math
 import secrets
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -13,11 +12,12 @@ from typing import Any
 from drivers.device_clock import DEVICE_CLOCK_MODULUS_US, DeviceClock
 from drivers.motor import reference_frames as telemetry
 from drivers.motor import reference_protocol as protocol
+from drivers.motor.permit import STOPPED_FROM_OUTSIDE
 from drivers.motor.reference_arming import MESSAGES as HANDSHAKE_MESSAGES
 from drivers.motor.reference_arming import ArmedWatch, Arming, Handshake
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
 from drivers.motor.reference_protocol import HouseKeeping
-from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
+from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS, check_command
 from drivers.types import (
     DriverState,
     DriverStats,
@@ -33,7 +33,7 @@ from drivers.types import (
     WheelCommand,
 )
 from firmware_protocol import status_codes
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, packaged_dbc
+from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
 
 # Five periods of SYSTEM_STATE (0.1 s): then the handshake begins anew.
 SILENCE_NS = 500_000_000
@@ -56,7 +56,6 @@ _STATES = {
     "FAULT": DriverState.FAULT,
     "ESTOP": DriverState.ESTOP,
 }
-_ON_THE_WAY = {DriverState.ARMING: "arming", DriverState.ARMED: "armed"}
 _MAY_ARM = frozenset(DriverState) - {
     DriverState.DISCONNECTED,
     DriverState.HANDSHAKE,
@@ -88,22 +87,32 @@ class ReferenceDriver:
         self._telemetry = telemetry.Telemetry(self._clock)
         self._handlers = self._create_handlers()
         self._arming = Arming(codec.dbc_hash, draw_session)
-        self._handshake = self._new_handshake()
         self._blocker_bits = codec.choices("SESSION_STATE", "blockers")
-        self._status: RobotStatus | None = None
         self._link_is_up = False
-        self._host_accepted = False
         self._commands_sent = 0
         self._watch = ArmedWatch()
-        self._device_us: int | None = None
-        self._reported_clock_errors: int | None = None
         self._clock_errors = 0
         self._last_received_ns = 0
         self._events: list[str] = []
-        self._foreign_reported = False
         self._released: str | None = None
         self._released_ns = 0
         self._now_ns = 0
+        self._restart("the driver is new")
+
+    def _restart(self, why: str) -> None:
+        """Void whatever was agreed with the robot."""
+        self._handshake = Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash, has_key=self._has_key)
+        self._reception.reset()
+        self._transmission.clear()
+        self._arming.reset(why)
+        self._telemetry.restart()
+        self._clock.clear()
+        self._house_keeping.clear()
+        self._device_us: int | None = None
+        self._status: RobotStatus | None = None
+        self._host_accepted = False
+        self._reported_clock_errors: int | None = None
+        self._foreign_reported = False
 
     @property
     def state(self) -> DriverState:
@@ -129,8 +138,8 @@ class ReferenceDriver:
         state, status, note = self.state, self._status, self._arming.note
         if self._released is not None and state is DriverState.FAULT:
             return f"{self._released}; remove the cause, then reset"
-        if state in _ON_THE_WAY:
-            return _ON_THE_WAY[state]
+        if state in (DriverState.ARMING, DriverState.ARMED):
+            return "arming" if state is DriverState.ARMING else "armed"
         if state is DriverState.DISCONNECTED:
             return f"the link is down; {note}" if note else "the link is down"
         if self._handshake.refusal is not None:
@@ -220,7 +229,11 @@ class ReferenceDriver:
             if decoded is None:
                 continue
             self._last_received_ns = min(received.t_ns, now_ns)
-            self._handle(decoded, received.t_ns, collected)
+            if decoded.name in self._handlers:
+                kind, handle = self._handlers[decoded.name]
+                sample = handle(decoded, received.t_ns)
+                if sample is not None:
+                    collected.setdefault(kind, []).append(sample)
         self._check_liveness(now_ns)
         self._report_outside_stop(stopped_ns)
         if self._reception.foreign is not None and not self._foreign_reported:
@@ -235,8 +248,7 @@ class ReferenceDriver:
         Raises ValueError for a command that is not finite, out of the wire's range, or valid for no time.
         """
         self._now_ns = now_ns
-        if command is not None:
-            _check(command)
+        check_command(command, SHORTEST_VALID_FOR_S)
         if not self._link_is_up:
             return ()
         self._check_liveness(now_ns)
@@ -250,7 +262,11 @@ class ReferenceDriver:
             frames.append(self._wheel_command(now_ns, "HOLD_ZERO", WheelCommand(0.0, 0.0, ZERO_VALID_FOR_S)))
         else:
             self._watch.rest()
-        return self._transmission.proved((*frames, *self._due(now_ns)))
+        refused = self._handshake.refusal is not None
+        introduced = self._host_accepted and self.identity is not None and not refused
+        state, samples = self._arming.host_state(), self._clock.count
+        frames += self._house_keeping.frames(now_ns, state, samples, introduced=introduced, refused=refused)
+        return self._transmission.proved(frames)
 
     def release(self, why: str) -> None:
         """Switch the motors off (COAST), then disarm, which brakes; without a session only disarm."""
@@ -295,22 +311,6 @@ class ReferenceDriver:
         self._commands_sent += 1
         return frame
 
-    def _due(self, now_ns: int) -> list[OutgoingFrame]:
-        """House-keeping frames due now."""
-        refused = self._handshake.refusal is not None
-        introduced = self._host_accepted and self.identity is not None and not refused
-        state, samples = self._arming.host_state(), self._clock.count
-        return self._house_keeping.frames(now_ns, state, samples, introduced=introduced, refused=refused)
-
-    def _handle(self, decoded: Decoded, received_ns: int, collected: dict[str, list[Any]]) -> None:
-        handler = self._handlers.get(decoded.name)
-        if handler is None:
-            return
-        kind, handle = handler
-        sample = handle(decoded, received_ns)
-        if sample is not None:
-            collected.setdefault(kind, []).append(sample)
-
     def _create_handlers(self) -> dict[str, tuple[str, Callable[[Decoded, int], Any]]]:
         """Return, by message name, the field of `Readings` and the function that makes a sample of a frame."""
         return {
@@ -320,14 +320,11 @@ class ReferenceDriver:
             "SYSTEM_STATE": ("status", self._on_status),
             "SESSION_STATE": ("", self._on_session),
             "TIME_RESPONSE": ("", self._on_time),
-            "MAC_CHALLENGE": ("", self._on_challenge),
+            "MAC_CHALLENGE": ("", lambda decoded, _: self._transmission.challenge(int(decoded.values["nonce"]))),
             "MOTOR": ("motors", telemetry.motor),
             "POWER": ("power", telemetry.power),
             "LINK_HEALTH": ("link_health", telemetry.link_health),
         }
-
-    def _on_challenge(self, decoded: Decoded, _received_ns: int) -> None:
-        self._transmission.challenge(int(decoded.values["nonce"]))
 
     def _on_handshake(self, decoded: Decoded, _received_ns: int) -> None:
         before, refusal = (self.identity, self.limits), self._handshake.refusal
@@ -375,7 +372,7 @@ class ReferenceDriver:
         """Say that somebody else sent an e-stop, once for frames that come within a second."""
         newest_ns = self._reception.outside_stop_ns
         if newest_ns is not None and (before_ns is None or newest_ns - before_ns > _ONE_STOP_NS):
-            self._events.append("e-stop received on the link, sent by `disco-hw estop` or another host")
+            self._events.append(STOPPED_FROM_OUTSIDE)
 
     def _count_clock_errors(self, reported: int) -> None:
         before, self._reported_clock_errors = self._reported_clock_errors, reported
@@ -394,16 +391,12 @@ class ReferenceDriver:
         before_us, self._device_us = self._device_us, device_us
         if not self._clock.add(sent_ns, received_ns, device_us):
             return
+        why, cause = "the robot has restarted", "its clock was set back"
         if before_us is not None and (device_us - before_us) % DEVICE_CLOCK_MODULUS_US < DEVICE_CLOCK_MODULUS_US // 2:
-            why = "its clock jumped"
-            event = (
-                "the robot's clock jumped: this computer was suspended, or the controller's clock is over 200 ppm off"
-            )
-        else:
-            why = "the robot has restarted"
-            event = f"{why}: its clock was set back"
+            why = "the robot's clock jumped"
+            cause = "this computer was suspended, or the controller's clock is over 200 ppm off"
         self._restart(why)
-        self._events.append(event)
+        self._events.append(f"{why}: {cause}")
 
     def _check_liveness(self, now_ns: int) -> None:
         """Start afresh with a robot that has fallen silent or has sample times that contradict its clock."""
@@ -423,23 +416,6 @@ class ReferenceDriver:
             self._telemetry.restart()
             self._events.append("sample times disagree with the robot's clock: synchronising the clocks again")
 
-    def _restart(self, why: str) -> None:
-        self._handshake = self._new_handshake()
-        self._reception.reset()
-        self._transmission.clear()
-        self._arming.reset(why)
-        self._telemetry.restart()
-        self._clock.clear()
-        self._house_keeping.clear()
-        self._device_us = None
-        self._status = None
-        self._host_accepted = False
-        self._reported_clock_errors = None
-        self._foreign_reported = False
-
-    def _new_handshake(self) -> Handshake:
-        return Handshake(PROTOCOL_MAJOR, PROTOCOL_MINOR, self._codec.dbc_hash, has_key=self._has_key)
-
     def _handshake_detail(self) -> str:
         missing = self._handshake.missing
         if len(missing) == 3:
@@ -449,12 +425,6 @@ class ReferenceDriver:
         if self._status is None:
             return "waiting for the robot's SYSTEM_STATE"
         return f"the robot is in {self._status.state}"
-
-
-def _check(command: WheelCommand) -> None:
-    finite = math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s)
-    if not finite or not command.valid_for_s >= SHORTEST_VALID_FOR_S:
-        raise ValueError(f"not a wheel command: {command}")
 
 
 def _create(_settings: NoSettings, key: bytes | None) -> ReferenceDriver:
@@ -467,9 +437,7 @@ DRIVER = MotorDriver(
     _create,
     stop_frames=protocol.stop_frames,
     stop_confirmation=protocol.stop_confirmation,
-    cyclic_frames=lambda _settings, rate_hz, authenticated: protocol.cyclic_frames(
-        packaged_dbc(), rate_hz, authenticated=authenticated
-    ),
+    cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
     recognise=protocol.recognise,
     kinds=("can", "serial"),

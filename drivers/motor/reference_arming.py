@@ -22,39 +22,59 @@ DELAY_NS = 150_000_000
 
 
 class ArmedWatch:
-    """Monitor of commands and state while armed; pure.
+    """Monitor of commands and state while armed; pure, times in ns of the host's clock.
 
-    `late_commands` counts the times that commands were late, `silent` those that no state was received.
+    Counters and the watchdog notice a frame that is missing and a pause; they do not notice commands that all come,
+    each in its turn, later and later. So what was sent is compared with what the robot has taken. `delay_ns`: how long
+    before the robot's last report the oldest command was sent that it had not taken, 0 for none. `late_commands`
+    counts the times that commands were late, `silent` those that no state was received.
     """
 
     def __init__(self) -> None:
         self.late_commands = 0
         self.silent = 0
-        self._echo = CommandEcho()
-        self._reported_ns: int | None = None
-        self._delay_ns = 0
-
-    def sent(self, number: int, now_ns: int) -> None:
-        """Remember a wheel command, by its number since the driver was made."""
-        self._echo.sent(number, now_ns)
+        self._waiting: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
+        self._last = 0
+        self._last_when_reported = 0
+        self.rest()
 
     def rest(self) -> None:
-        """Expect nothing, because nothing is commanded."""
-        self._echo.clear()
-        self._reported_ns = None
-        self._delay_ns = 0
+        """Expect nothing of what was sent so far, because nothing is commanded."""
+        self._waiting.clear()
+        self._accepted: int | None = None
+        self._reported_ns: int | None = None
+        self.delay_ns = 0
+
+    def sent(self, number: int, now_ns: int) -> None:
+        """Remember the command of this number since the driver was made; its counter is the number modulo 16."""
+        self._waiting.append((number, now_ns))
+        self._last = number
 
     def reported(self, last_command_counter: int, received_ns: int) -> None:
-        """Store the reception of SYSTEM_STATE, with the delay of the command that it echoes."""
-        self._reported_ns = received_ns
-        self._delay_ns = self._echo.delay_ns(last_command_counter, received_ns)
+        """Take in SYSTEM_STATE, with the counter of the last command that the robot took.
+
+        The counter has four bits: where sixteen commands or more were sent since the last report, the robot is taken
+        to be as little behind as it can be.
+        """
+        self._reported_ns, self.delay_ns = received_ns, 0
+        waiting = self._waiting
+        if not waiting:
+            return
+        accepted = self._find_accepted(last_command_counter)
+        if accepted >= waiting[0][0] or self._accepted is not None:
+            self._accepted = accepted
+        self._last_when_reported = self._last
+        while waiting and waiting[0][0] <= accepted:
+            waiting.popleft()
+        if waiting:
+            self.delay_ns = received_ns - waiting[0][1]
 
     def objection(self, now_ns: int) -> str | None:
         """Return why a robot that is armed must not stay so, None while all is well; counts each call that objects."""
-        if self._delay_ns > DELAY_NS:
+        if self.delay_ns > DELAY_NS:
             self.late_commands += 1
             return (
-                f"commands reach the robot over {self._delay_ns * 1e-9:.2f} s late; check the load of the link and "
+                f"commands reach the robot over {self.delay_ns * 1e-9:.2f} s late; check the load of the link and "
                 "of this computer"
             )
         if self._reported_ns is not None and now_ns - self._reported_ns > STATE_TIMEOUT_NS:
@@ -64,47 +84,6 @@ class ArmedWatch:
                 "of the link"
             )
         return None
-
-
-class CommandEcho:
-    """Compares what was sent with what the robot has taken.
-
-    Counters and the watchdog notice a frame that is missing and a pause; they do not notice commands that all come,
-    each in its turn, later and later. Pure; times in ns of the host's clock.
-    """
-
-    def __init__(self) -> None:
-        self._waiting: deque[tuple[int, int]] = deque(maxlen=_REMEMBERED)
-        self._last = 0
-        self._last_when_reported = 0
-        self._accepted: int | None = None
-
-    def sent(self, number: int, now_ns: int) -> None:
-        """Remember the command of this number, whose frame has the number modulo 16 as its counter."""
-        self._waiting.append((number, now_ns))
-        self._last = number
-
-    def clear(self) -> None:
-        """Expect no more of what was sent so far."""
-        self._waiting.clear()
-        self._accepted = None
-
-    def delay_ns(self, counter: int, received_ns: int) -> int:
-        """Return how long before `received_ns` the oldest command was sent that the robot had not taken; 0 for none.
-
-        `counter` is that of the last command it took. It has four bits: where sixteen commands or more were sent since
-        the last report, the robot is taken to be as little behind as it can be.
-        """
-        waiting = self._waiting
-        if not waiting:
-            return 0
-        accepted = self._find_accepted(counter)
-        if accepted >= waiting[0][0] or self._accepted is not None:
-            self._accepted = accepted
-        self._last_when_reported = self._last
-        while waiting and waiting[0][0] <= accepted:
-            waiting.popleft()
-        return received_ns - waiting[0][1] if waiting else 0
 
     def _find_accepted(self, counter: int) -> int:
         """Return the number of the last accepted command, inferred from its counter."""

@@ -259,7 +259,8 @@ class Telemetry:
             received_ns=received_ns,
             x_m=position["x"],
             y_m=position["y"],
-            yaw_rad=_wrap(heading["yaw"]),
+            # Into (-pi, pi]: the wire's range is a little wider.
+            yaw_rad=math.pi - (math.pi - heading["yaw"]) % (2.0 * math.pi),
             position_std_m=heading["position_std"],
             yaw_std_rad=heading["yaw_std"],
         )
@@ -325,18 +326,11 @@ def link_health(decoded: Decoded, received_ns: int) -> RobotLinkHealth:
     return RobotLinkHealth(t_ns=received_ns, **values)
 
 
-def _wrap(angle_rad: float) -> float:
-    """Wrap into (-pi, pi]; the wire's range is a little wider."""
-    return math.pi - (math.pi - angle_rad) % (2.0 * math.pi)
-
-
 class FramePairs:
     """Pairs frames of two messages that carry the same counter and arrive within 50 ms of each other.
 
     The counter alone would not do: it is the same again after sixteen samples.
     """
-
-    __slots__ = ("_first_name", "_waiting", "_waiting_since_ns")
 
     def __init__(self, first_name: str) -> None:
         self._first_name = first_name
@@ -365,39 +359,24 @@ class WheelTicks:
     readings in a row the counters are taken as they are, with no motion in between. The first reading is `start`.
     """
 
-    __slots__ = (
-        "_angle_per_tick",
-        "_left",
-        "_max_ticks_per_us",
-        "_rejected",
-        "_right",
-        "_start",
-        "_t_us",
-        "_ticks_left",
-        "_ticks_right",
-    )
-
     def __init__(self, ticks_per_rev: int, max_speed_rad_s: float, start: tuple[float, float] = (0.0, 0.0)) -> None:
         self._start = start
         self._angle_per_tick = 2.0 * math.pi / ticks_per_rev
         self._max_ticks_per_us = SPEED_MARGIN * max_speed_rad_s / self._angle_per_tick * 1e-6
-        self._left = 0
-        self._right = 0
+        self._left = self._right = 0
         self._rejected = 0
-        self._ticks_left: int | None = None
-        self._ticks_right = 0
-        self._t_us = 0
+        self._last: tuple[int, int, int] | None = None
 
     def clear(self) -> None:
         """Take the next reading as it is: the angles go on from where they are."""
-        self._ticks_left = None
+        self._last = None
 
     def update(self, ticks_left: int, ticks_right: int, t_us: int) -> tuple[float, float] | None:
         """Take in a reading of device time `t_us` (which does not wrap); return both angles, None if implausible."""
-        if self._ticks_left is not None:
-            left = _shortest(ticks_left - self._ticks_left)
-            right = _shortest(ticks_right - self._ticks_right)
-            limit = min(self._max_ticks_per_us * (t_us - self._t_us) + SLACK_TICKS, TICKS_MODULUS // 2 - 1)
+        if self._last is not None:
+            last_left, last_right, last_us = self._last
+            left, right = _shortest(ticks_left - last_left), _shortest(ticks_right - last_right)
+            limit = min(self._max_ticks_per_us * (t_us - last_us) + SLACK_TICKS, TICKS_MODULUS // 2 - 1)
             if max(abs(left), abs(right)) <= limit:
                 self._left += left
                 self._right += right
@@ -406,7 +385,7 @@ class WheelTicks:
                 if self._rejected < REANCHOR_AFTER:
                     return None
         self._rejected = 0
-        self._ticks_left, self._ticks_right, self._t_us = ticks_left, ticks_right, t_us
+        self._last = (ticks_left, ticks_right, t_us)
         return self.angles
 
     @property

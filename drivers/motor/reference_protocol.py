@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import msgspec
+
 from drivers.motor.reference_arming import HostState
 from drivers.motor.reference_frames import FrameReception, FrameTransmission
 from drivers.types import CyclicFrame, Frame, NoSettings, OutgoingFrame, ReceivedFrame, SafetyCard
-from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded, load_protocol
+from firmware_protocol.codec import PROTOCOL, PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
 
 # Chosen: each has an 8-bit check sum that fits a foreign frame by chance, five do not.
 _FRAMES_OF_OURS = 5
@@ -32,13 +34,13 @@ _DEADLINE_NS = 100_000_000
 _PENDING_TIMES = 8
 
 
-def cyclic_frames(dbc: str, command_rate_hz: float, *, authenticated: bool = False) -> tuple[CyclicFrame, ...]:
-    """Return all frames with a cycle time (GenMsgCycleTime, ms) in the DBC's text, each page of a multiplexed one.
+def cyclic_frames(_settings: NoSettings, command_rate_hz: float, authenticated: bool) -> tuple[CyclicFrame, ...]:
+    """Return all frames with a cycle time (GenMsgCycleTime) in the DBC, each page of a multiplexed one.
 
     The wheel command counts at the rate of the control loop; proofs and their challenge only if `authenticated`.
     """
     frames = []
-    for message in load_protocol(dbc).messages:
+    for message in PROTOCOL.messages:
         if message.period_s is not None and (authenticated or message.name not in _AUTHENTICATION_FRAMES):
             pages = {signal.page for signal in message.signals} - {None}
             rate_hz = command_rate_hz if message.name in _COMMANDS else 1.0 / message.period_s
@@ -111,38 +113,20 @@ class HouseKeeping:
         `introduced`: whether host and robot have accepted each other; `refused`: whether the host refuses this robot.
         `clock_samples`: number of responses in the estimate of the robot's clock.
         """
-        frames = []
-        transmission = self._transmission
+        due: dict[str, dict[str, float | str]] = {}
+        is_due = self._transmission.due
         hello_period_ns = REFUSED_HELLO_PERIOD_NS if refused else HELLO_PERIOD_NS
-        if not introduced and transmission.due("HELLO_REQUEST", now_ns, hello_period_ns):
-            frames.append(
-                transmission.frame(
-                    "HELLO_REQUEST",
-                    now_ns,
-                    _DEADLINE_NS,
-                    protocol_major=PROTOCOL_MAJOR,
-                    protocol_minor=PROTOCOL_MINOR,
-                    dbc_hash=self._dbc_hash,
-                )
-            )
-        if state != self._host_state or transmission.due("HOST_STATE", now_ns, HOST_STATE_PERIOD_NS):
+        if not introduced and is_due("HELLO_REQUEST", now_ns, hello_period_ns):
+            version = {"protocol_major": PROTOCOL_MAJOR, "protocol_minor": PROTOCOL_MINOR}
+            due["HELLO_REQUEST"] = {**version, "dbc_hash": self._dbc_hash}
+        if state != self._host_state or is_due("HOST_STATE", now_ns, HOST_STATE_PERIOD_NS):
             self._host_state = state
-            frames.append(
-                transmission.frame(
-                    "HOST_STATE",
-                    now_ns,
-                    _DEADLINE_NS,
-                    request=state.request,
-                    session=state.session,
-                    challenge_answer=state.challenge_answer,
-                    host_fault=0,
-                )
-            )
+            due["HOST_STATE"] = {**msgspec.structs.asdict(state), "host_fault": 0}
         time_period_ns = FAST_TIME_PERIOD_NS if clock_samples < FAST_TIME_COUNT else TIME_PERIOD_NS
-        if transmission.due("TIME_REQUEST", now_ns, time_period_ns):
+        if is_due("TIME_REQUEST", now_ns, time_period_ns):
             self._time_sequence = (self._time_sequence + 1) % 256
             self._time_requests[self._time_sequence] = now_ns
             if len(self._time_requests) > _PENDING_TIMES:
                 del self._time_requests[next(iter(self._time_requests))]
-            frames.append(transmission.frame("TIME_REQUEST", now_ns, _DEADLINE_NS, sequence=self._time_sequence))
-        return frames
+            due["TIME_REQUEST"] = {"sequence": self._time_sequence}
+        return [self._transmission.frame(name, now_ns, _DEADLINE_NS, **signals) for name, signals in due.items()]

@@ -16,7 +16,6 @@ from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.roboclaw_protocol import (
     RoboclawExchange,
     RoboclawSettings,
-    is_stationary,
     query,
     setting,
     stop_frames,
@@ -66,6 +65,8 @@ _ERROR_TEXTS = {
 TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
 
 
+# Chosen: above the noise of a counted speed, and below any motion that could matter.
+_STATIONARY_RAD_S = 0.1
 # As many as the reference controller asks for (firmware/command.c).
 ZEROS_TO_ARM = 5
 # Chosen: five replies at 50 Hz; gone when a board could have been switched off and on.
@@ -150,7 +151,7 @@ class Board:
             motor.reset_state()
 
 
-class RoboclawPort(Port):
+class _RoboclawPort(Port):
     """Port of `VendorDriver` for RoboClaw boards."""
 
     def __init__(self, settings: RoboclawSettings) -> None:
@@ -161,7 +162,6 @@ class RoboclawPort(Port):
             watchdog_s=settings.watchdog_s,
             idle=Stage.BRAKING,
             after_loss=Stage.BRAKING,
-            begins=Stage.BRAKING,
         )
         self._boards = {address: Board(address) for address in settings.addresses}
         self._velocity_ns = self._requested_ns = 0
@@ -169,7 +169,6 @@ class RoboclawPort(Port):
 
     @property
     def seen(self) -> Controllers:
-        """State of the boards, as received last."""
         silent = ", ".join(str(board.address) for board in self._all if not board.is_known)
         missing = (
             f"board {silent} does not answer; check that it is switched on, in packet serial, at this baud and address"
@@ -203,7 +202,6 @@ class RoboclawPort(Port):
         return all(board.stopped and "speeds" in board.known for board in self._all) and self._is_stationary
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the boards reported."""
         for board in self._all:
             board.reset_state()
 
@@ -214,7 +212,6 @@ class RoboclawPort(Port):
             board.stopped, board.refuses_ns = False, None
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a reply."""
         frame, t_ns = received.frame, received.t_ns
         address, command = divmod(frame.can_id, 256)
         board = self._boards.get(address)
@@ -242,7 +239,6 @@ class RoboclawPort(Port):
         return FrameReport(counts=IMPLAUSIBLE, is_status=is_status, wheels=wheels, lost=jumped)
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: each board that is known."""
         return [
             Source(f"board {board.address}", board.waits_ns if board.known else None, SILENT_NS, GONE_NS)
             for board in self._all
@@ -284,7 +280,6 @@ class RoboclawPort(Port):
         return Pending(why="a board does not accept commands of zero", frames=tuple(self.speeds(now_ns, 0.0, 0.0)))
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frames that command the speeds of each board's motors."""
         settings, self._velocity_ns = self._settings, now_ns
         per_board = {address: [0.0, 0.0] for address in self._boards}
         fastest, commanded = self._fastest_rad_s, (left_rad_s, right_rad_s)
@@ -345,7 +340,6 @@ class RoboclawPort(Port):
         return tuple(OutgoingFrame(frame, now_ns + _QUERY_LIFE_NS, _QUERY_RANK) for frame in frames)
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Zero duty for every board."""
         return tuple(_stop(board.address) for board in self._all)
 
     @property
@@ -359,7 +353,8 @@ class RoboclawPort(Port):
 
     @property
     def _is_stationary(self) -> bool:
-        return all(is_stationary(self._settings, *board.speeds) for board in self._all)
+        fastest = _STATIONARY_RAD_S * self._settings.counts_per_rad
+        return all(abs(speed) < fastest for board in self._all for speed in board.speeds)
 
     @property
     def _fastest_rad_s(self) -> float:
@@ -391,7 +386,7 @@ def _stop(address: int) -> Frame:
 
 DRIVER = MotorDriver(
     "roboclaw",
-    lambda settings, _key: VendorDriver(RoboclawPort(settings)),
+    lambda settings, _key: VendorDriver(_RoboclawPort(settings)),
     settings=RoboclawSettings,
     example=protocol.EXAMPLE,
     kinds=("serial",),
@@ -400,7 +395,7 @@ DRIVER = MotorDriver(
     questions=protocol.QUESTIONS,
     latches_stop=False,
     stop_frames=stop_frames,
-    stop_confirmation=lambda settings: stop_confirmation(RoboclawPort(settings)),
+    stop_confirmation=lambda settings: stop_confirmation(_RoboclawPort(settings)),
     cyclic_frames=protocol.cyclic_frames,
     safety_card=protocol.safety_card,
 )

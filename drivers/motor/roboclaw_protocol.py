@@ -145,8 +145,6 @@ def _in_range(value: int, code: str) -> int:
     return min(max(value, low), high)
 
 
-# Chosen: above the noise of a counted speed, and below any motion that could matter.
-STATIONARY_RAD_S = 0.1
 # Estimate of how long a board takes to answer, for the load of the line alone.
 _TURNAROUND_S = 0.0009
 _MOTOR = re.compile(r"(\d{1,3})/([12])")
@@ -266,11 +264,6 @@ def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:
         *(setting(address, "duty_m1m2", duty_m1=0, duty_m2=0) for address in settings.addresses),
         *(query(address, "speeds") for address in settings.addresses),
     )
-
-
-def is_stationary(settings: RoboclawSettings, *speeds_counts_s: Value) -> bool:
-    """Whether these motors' speeds are those of wheels at rest."""
-    return all(abs(float(speed)) < STATIONARY_RAD_S * settings.counts_per_rad for speed in speeds_counts_s)
 
 
 def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -9,18 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.motor import ros2_base_wire as wire
-from drivers.motor import vendor_parts as parts
+from drivers.motor.body_port import BodyPort
 from drivers.motor.permit import Controllers, MotionPermit, Stage
 from drivers.motor.vendor_driver import (
-    IMPLAUSIBLE,
     REJECTED_LENGTH,
     UNKNOWN,
-    BodyPort,
     FrameReport,
     Objection,
     Pending,
     Source,
-    Table,
     VendorDriver,
     stop_confirmation,
 )
@@ -28,7 +25,6 @@ from drivers.types import (
     Frame,
     Identity,
     Limit,
-    Limits,
     MotorDriver,
     ReceivedFrame,
     Request,
@@ -37,26 +33,22 @@ from drivers.types import (
 
 # Chosen: five reports of the bridge, which come every 50 ms; gone, longer than a disturbance of the network.
 SILENT_NS, GONE_NS = 250_000_000, 1_000_000_000
+# Chosen: above the noise of odometry.
+_STATIONARY_M_S = 0.02
 
 
-class Ros2BasePort(BodyPort):
+class _Ros2BasePort(BodyPort):
     """Port of `VendorDriver` for bases on ROS 2."""
 
     settings: wire.Ros2BaseSettings
 
     def __init__(self, settings: wire.Ros2BaseSettings) -> None:
-        self.settings = settings
+        super().__init__(settings, wire.DEADMAN_S, Limit(settings.watchdog_s, "robot.toml"))
         self._check_sum = settings.check_sum()
-        self.table = Table(
-            stop_deceleration_rad_s2=settings.stop_deceleration_rad_s2, watchdog_s=wire.DEADMAN_S, zeros_to_arm=5
-        )
         self._refusal = self._bridge_sum = 0
-        self._turned = (parts.Odometer(), parts.Odometer())
-        self.reset_state(0)
 
     @property
     def seen(self) -> Controllers:
-        """State of the bridge and its base, as received last."""
         stopped = f"a button on the base is pressed{self._or_unheard}" if self._flags & wire.BUTTON else None
         latched = "emergency stop; remove its cause, then reset" if self._flags & wire.LATCHED else None
         return Controllers(
@@ -74,31 +66,19 @@ class Ros2BasePort(BodyPort):
         return Identity("ROS 2 base", "", "robot.toml") if is_met else None
 
     @property
-    def limits(self) -> Limits:
-        """Limits that robot.toml declares of the base, which reports none itself."""
-        return parts.limits(
-            Limit(self.settings.fastest_rad_s, "robot.toml"),
-            Limit(self.settings.watchdog_s, "robot.toml"),
-            self.table.stop_deceleration_rad_s2,
-        )
-
-    @property
     def is_stopped(self) -> bool:
         """Whether the bridge has latched a stop and the base stands, or a button of it is pressed."""
         is_latched = self._flags & wire.LATCHED and not self._flags & wire.DRIVING
         return bool((is_latched and self._wheels_ns is not None and self._is_stationary) or self._flags & wire.BUTTON)
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the bridge reported."""
+        super().reset_state(now_ns)
         self._state_ns: int | None = None
         self._wheels_ns: int | None = None
         self._newest: tuple[int, int] | None = None
-        self._flags, self._wheel_speeds = 0, (0.0, 0.0)
-        for side in self._turned:
-            side.reset_state()
+        self._flags, self._wheel_speeds, self._age_s = 0, (0.0, 0.0), 0.0
 
     def handle(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
-        """Take in a frame of the bridge, or of another host."""
         frame, data = received.frame, received.frame.data
         if frame.extended or frame.can_id not in wire.LENGTHS:
             return UNKNOWN
@@ -115,11 +95,14 @@ class Ros2BasePort(BodyPort):
         if frame.can_id == wire.ANGLES:
             self._newest = wire.unpack_angles(data)
         elif self._newest is not None:
-            return self._handle_wheels(self._newest, data, received.t_ns, permit.looked_ns)
+            self._wheel_speeds, self._age_s = wire.unpack_wheels(data)
+            angles, self._newest, self._wheels_ns = self._newest, None, received.t_ns
+            fastest = 1.5 * self.settings.fastest_rad_s / wire.ANGLE_RAD
+            # Messages of a base do not come evenly.
+            return self._handle_counts(angles, received.t_ns, permit.looked_ns, fastest, 0.1 * fastest)
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the sources that must report again and again: the bridge, and the base behind it."""
         return (
             Source("the bridge", self._state_ns, SILENT_NS, GONE_NS),
             Source("the base's odometry", self._wheels_ns, SILENT_NS),
@@ -163,7 +146,7 @@ class Ros2BasePort(BodyPort):
 
     def stop_frames(self) -> tuple[Frame, ...]:
         """Return the stop that the bridge latches."""
-        return wire.stop_frames(self.settings)
+        return (Frame(wire.STOP, b""),)
 
     def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
         return wire.speeds(linear_m_s, angular_rad_s)
@@ -202,35 +185,21 @@ class Ros2BasePort(BodyPort):
 
     @property
     def _is_stationary(self) -> bool:
-        return self.settings.is_stationary(*self._wheel_speeds)
+        return self.settings.wheel_radius_m * max(map(abs, self._wheel_speeds)) < _STATIONARY_M_S
 
-    def _handle_wheels(self, angles: tuple[int, int], data: bytes, t_ns: int, looked_ns: int) -> FrameReport:
-        """Return a sample of ANGLES and WHEELS; what the wheels could not have turned is left out."""
-        self._wheel_speeds, age_s = wire.unpack_wheels(data)
-        fastest = 1.5 * self.settings.fastest_rad_s / wire.ANGLE_RAD
-        plausible = [
-            # Messages of a base do not come evenly.
-            side.add_wrapping(angle, t_ns, looked_ns, fastest, 0.1 * fastest)
-            for side, angle in zip(self._turned, angles, strict=True)
-        ]
-        self._newest, self._wheels_ns = None, t_ns
+    def _sample(self, t_ns: int) -> WheelSample:
         left, right = (wire.ANGLE_RAD * side.total for side in self._turned)
-        wheels = WheelSample(t_ns - round(age_s * 1e9), t_ns, left, right, *self._wheel_speeds)
-        if all(plausible):
-            return FrameReport(wheels=wheels)
-        return FrameReport(
-            counts=IMPLAUSIBLE, wheels=wheels, lost="the base has restarted: the angles of its wheels jumped"
-        )
+        return WheelSample(t_ns - round(self._age_s * 1e9), t_ns, left, right, *self._wheel_speeds)
 
 
 DRIVER = MotorDriver(
     "ros2_base",
-    lambda settings, _key: VendorDriver(Ros2BasePort(settings)),
+    lambda settings, _key: VendorDriver(_Ros2BasePort(settings)),
     settings=wire.Ros2BaseSettings,
     takes_body_speeds=True,
     example=wire.EXAMPLE,
-    stop_frames=wire.stop_frames,
-    stop_confirmation=lambda settings: stop_confirmation(Ros2BasePort(settings)),
+    stop_frames=lambda settings: _Ros2BasePort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_Ros2BasePort(settings)),
     cyclic_frames=wire.cyclic_frames,
     safety_card=wire.safety_card,
 )

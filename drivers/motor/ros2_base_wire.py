@@ -15,7 +15,7 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from drivers.motor.vendor_parts import BodySettings
+from drivers.motor.body_port import BodySettings
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Chosen for this link alone: e-stop first, as low identifiers go first on CAN.
@@ -38,8 +38,6 @@ DEADMAN_S = 0.2
 ZEROS_S = 0.5
 # Period of those zeros: 50 Hz, as the commands.
 STEP_S = 0.02
-# Chosen: above the noise of odometry.
-STATIONARY_M_S = 0.02
 # Steps on the wire; WHEELS' speeds in 16 bits reach 65 rad/s, and the age 6.5 s.
 ANGLE_RAD = 1e-4
 _SPEED_RAD_S, _AGE_S = 2e-3, 1e-4
@@ -66,7 +64,6 @@ class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw
     """
 
     watchdog_s: Annotated[float, Meta(gt=0.0, le=1.0)]
-    stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
     speed_topic: Annotated[str, Meta(min_length=1, max_length=200)] = "/cmd_vel"
     speed_stamped: bool = False
     wheels_topic: Annotated[str, Meta(max_length=200)] = ""
@@ -90,10 +87,6 @@ class Ros2BaseSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw
     def wheels_from(self) -> str:
         """The topic that says how the wheels turn."""
         return self.wheels_topic or ("/joint_states" if self.left_joints else "/odom")
-
-    def is_stationary(self, left_rad_s: float, right_rad_s: float) -> bool:
-        """Whether these are wheels of a base that does not move."""
-        return self.wheel_radius_m * max(abs(left_rad_s), abs(right_rad_s)) < STATIONARY_M_S
 
     def check_sum(self) -> int:
         """Return a CRC-32 of all fields: driver and bridge must have been started with the same."""
@@ -221,11 +214,6 @@ class BaseEnd:
         if self.driving and now_ns - self._fed_ns > DEADMAN_S * 1e9:
             self._fell_silent = True
             self.hold_standstill(now_ns)
-
-
-def stop_frames(_settings: Ros2BaseSettings) -> tuple[Frame, ...]:
-    """Return the e-stop, which the bridge latches."""
-    return (Frame(STOP, b""),)
 
 
 def cyclic_frames(_settings: Ros2BaseSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -7,6 +7,7 @@ permit to move and hands it to the port as a value; the port never changes it.
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 
@@ -45,8 +46,8 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
 
     `watchdog_s`: after what silence of the host they have stopped by themselves, where they keep no state that shows
     it, so that a later command would move them again; None where they do. `zeros_to_arm`: zeros commanded before the
-    first speed. `slowest_rad_s`: the slowest speed that they hold, at which the ramp of a stop ends. `idle` and
-    `after_loss`: see `MotionPermit`; `begins`: the stage in which they are met.
+    first speed. `slowest_rad_s`: the slowest speed that they hold, at which the ramp of a stop ends. `idle`, in which
+    they are met, and `after_loss`: see `MotionPermit`.
     """
 
     stop_deceleration_rad_s2: float
@@ -55,7 +56,6 @@ class Table(msgspec.Struct, frozen=True, kw_only=True):
     slowest_rad_s: float = 0.0
     idle: Idle = Stage.REST
     after_loss: Idle = Stage.REST
-    begins: Idle = Stage.REST
 
 
 class Source(msgspec.Struct, frozen=True):
@@ -198,39 +198,6 @@ class Port(ABC):
         return is_due
 
 
-class BodyPort(Port):
-    """Port of a base that takes speed and turn rate of its body, and makes wheel speeds of them by its own track."""
-
-    settings: parts.BodySettings
-
-    def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frame that commands the body's motion, by the nominal geometry."""
-        it = self.settings
-        left_m_s, right_m_s = it.wheel_radius_m * left_rad_s, it.wheel_radius_m * right_rad_s
-        scale = min(1.0, it.max_speed_m_s / max(abs(left_m_s), abs(right_m_s), 1e-9))
-        return (self._motion(scale * (left_m_s + right_m_s) / 2.0, scale * (right_m_s - left_m_s) / it.track_m),)
-
-    def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:
-        """Zero speed until the base stands, then the frames of standby."""
-        if self._is_stationary or lasts_ns > BRAKING_NS:
-            self._repeat_ns = now_ns
-            return self._standby_frames(), True
-        return (self._motion(0.0, 0.0),), False
-
-    @property
-    @abstractmethod
-    def _is_stationary(self) -> bool:
-        """Whether the base says that it does not move."""
-
-    @abstractmethod
-    def _motion(self, linear_m_s: float, angular_rad_s: float) -> Frame:
-        """Return the command of these speeds of the body."""
-
-    @abstractmethod
-    def _standby_frames(self) -> tuple[Frame, ...]:
-        """Return the frames after which a base that stands takes no speeds."""
-
-
 def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
     """Return what says, frame by frame heard, whether the controllers have confirmed an e-stop that was sent to them.
 
@@ -255,7 +222,7 @@ class VendorDriver:
         table = port.table
         self._port = port
         self._table = table
-        self._permit = MotionPermit(idle=table.idle, after_loss=table.after_loss, stage=table.begins)
+        self._permit = MotionPermit(idle=table.idle, after_loss=table.after_loss, stage=table.idle)
         self.stats = DriverStats()
 
     @property
@@ -315,15 +282,12 @@ class VendorDriver:
 
         Raises ValueError for a command that is not finite or valid for no time.
         """
-        parts.check_command(command)
+        parts.check_command(command, 0.0)
         if not self._permit.link_is_up:
             return ()
         if self._table.watchdog_s is not None and self._permit.is_late(now_ns, self._table.watchdog_s):
-            self._end(
-                self._permit.lost(
-                    "no command was sent for longer than the controllers' time-out; check the load of this computer"
-                )
-            )
+            why = "no command was sent for longer than the controllers' time-out; check the load of this computer"
+            self._end(self._permit.lost(why))
         sent = self._step(now_ns, command)
         return (*sent, *self._port.questions(now_ns, self._permit))
 
@@ -347,7 +311,9 @@ class VendorDriver:
                     return ()
                 self._permit = self._permit.commanded(now_ns, command)
                 self._count("commands_sent")
-                return parts.commanding(now_ns, command, *self._port.speeds(now_ns, *self._permit.speeds))
+                frames = self._port.speeds(now_ns, *self._permit.speeds)
+                # Half of the command's validity may pass on the way.
+                return parts.outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
             case Stage.ARMING:
                 frames = self._arm(now_ns)
             case Stage.STOPPING:
@@ -421,18 +387,16 @@ class VendorDriver:
             self._end(self._permit.given_up(objection.why).with_event(objection.why))
 
     def _check_silence(self, now_ns: int) -> None:
+        is_idle = self._permit.stage in (Stage.REST, self._table.idle)
         for source in self._port.sources():
             silent_ns = 0 if source.received_ns is None else self._permit.silent_ns(source.received_ns)
             why = f"{source.name} stopped reporting"
             if self._may_lose:
                 if silent_ns > source.silent_ns:
-                    self._end(
-                        self._permit.lost(
-                            f"{why}: no frame for {source.silent_ns * 1e-9:g} s; check its power and the cable"
-                        )
-                    )
+                    why = f"{why}: no frame for {source.silent_ns * 1e-9:g} s; check its power and the cable"
+                    self._end(self._permit.lost(why))
                     return
-            elif self._is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
+            elif is_idle and source.gone_ns is not None and silent_ns > source.gone_ns:
                 self._restart_handshake(self._permit.restarted(why, f"{why}: waiting for it"), now_ns)
                 return
 
@@ -440,10 +404,6 @@ class VendorDriver:
     def _may_lose(self) -> bool:
         """Whether something that is wrong has a drive to end, and has not ended it already."""
         return self._permit.stage not in (Stage.REST, self._table.after_loss)
-
-    @property
-    def _is_idle(self) -> bool:
-        return self._permit.stage in (Stage.REST, self._table.idle)
 
     def _end(self, permit: MotionPermit) -> None:
         self._permit = permit
@@ -454,4 +414,4 @@ class VendorDriver:
         self._port.reset_state(now_ns)
 
     def _count(self, name: str) -> None:
-        self.stats = parts.counted(self.stats, name)
+        self.stats = dataclasses.replace(self.stats, **{name: getattr(self.stats, name) + 1})

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Annotated, Any, Literal
-
-import msgspec
-from msgspec import Meta
+from typing import Any, Literal
 
 from drivers.types import (
     DriverState,
-    DriverStats,
     Frame,
     Limit,
     Limits,
     OutgoingFrame,
     RobotStatus,
+    SettingsFault,
     WheelCommand,
     WheelSample,
 )
@@ -35,22 +31,6 @@ _ESTOP_RANK, _RANK = 0, 1
 Nodes = int | tuple[int, ...]
 """Ids on CAN of one side's controllers, as robot.toml names them."""
 Sign = Literal[-1, 1]
-
-
-class BodySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings in [link] of a base that takes speeds of its body: the nominal geometry, and what the base can do.
-
-    Write the geometry of [robot] there, and leave it when the model learns another.
-    """
-
-    wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
-    track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
-    max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
-
-    @property
-    def fastest_rad_s(self) -> float:
-        """The wheel speed of the base's largest speed."""
-        return self.max_speed_m_s / self.wheel_radius_m
 
 
 @dataclass(slots=True)
@@ -174,22 +154,18 @@ def limits(fastest: Limit, timeout: Limit, stop_deceleration_rad_s2: float) -> L
     return Limits(max_wheel_speed_rad_s=fastest, command_timeout_s=timeout, stop_deceleration_rad_s2=slows)
 
 
-def check_command(command: WheelCommand | None) -> None:
-    """Raise ValueError for a command that is not finite or valid for no time."""
-    if command is not None and not (
-        math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s) and command.valid_for_s > 0.0
-    ):
+def check_command(command: WheelCommand | None, shortest_s: float) -> None:
+    """Raise ValueError for a command that is not finite, or valid for no time or for less than `shortest_s`."""
+    if command is None:
+        return
+    is_finite = math.isfinite(command.left_rad_s) and math.isfinite(command.right_rad_s)
+    if not (is_finite and command.valid_for_s > 0.0 and command.valid_for_s >= shortest_s):
         raise ValueError(f"not a wheel command: {command}")
 
 
 def outgoing(now_ns: int, *frames: Frame, life_ns: int = _FRAME_LIFE_NS) -> tuple[OutgoingFrame, ...]:
     """Frames to be sent within `life_ns`, in this order, after any e-stop."""
     return tuple(OutgoingFrame(frame, now_ns + life_ns, _RANK) for frame in frames)
-
-
-def commanding(now_ns: int, command: WheelCommand, *frames: Frame) -> tuple[OutgoingFrame, ...]:
-    """Return the frames of a command: half of its validity may pass on the way."""
-    return outgoing(now_ns, *frames, life_ns=round(0.5e9 * command.valid_for_s))
 
 
 def estop_frames(now_ns: int, frames: tuple[Frame, ...]) -> tuple[OutgoingFrame, ...]:
@@ -217,11 +193,6 @@ def status(t_ns: int, state: DriverState, stop_confirmed: bool) -> RobotStatus:
     )
 
 
-def counted(stats: DriverStats, name: str) -> DriverStats:
-    """Return the counters, with one more of `name`."""
-    return dataclasses.replace(stats, **{name: getattr(stats, name) + 1})
-
-
 def sides_of(nodes: tuple[Nodes, Nodes]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Return the ids on the left and on the right."""
     left, right = ((side,) if isinstance(side, int) else side for side in nodes)
@@ -232,6 +203,19 @@ def all_of(nodes: tuple[Nodes, Nodes]) -> tuple[int, ...]:
     """Return every id, left before right."""
     left, right = sides_of(nodes)
     return (*left, *right)
+
+
+def nodes_fault(nodes: tuple[Nodes, Nodes], largest: int, reserved: int | None = None) -> SettingsFault | None:
+    """Return what is wrong with the ids in link.nodes, or None; `reserved` is an id that no controller may have."""
+    ids = all_of(nodes)
+    if not all(sides_of(nodes)):
+        return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [3, 5]")
+    if any(not 0 <= one <= largest or one == reserved for one in ids):
+        of_host = "" if reserved is None else f", or is {reserved}, the id of this host"
+        return SettingsFault("nodes", f"an id is outside 0 to {largest}{of_host}", "write the ids of the controllers")
+    if len(set(ids)) != len(ids):
+        return SettingsFault("nodes", "an id is listed twice", "give each controller an id of its own")
+    return None
 
 
 def in_sides(nodes: Sequence[int | str]) -> list[Any]:

@@ -50,10 +50,9 @@ _PING_PERIOD_NS = 100_000_000
 _FAULT_PERIOD_NS = 50_000_000
 # A little under the 20 ms of a tick at 50 Hz, so that a tick that comes early is not left out.
 _POLL_PERIOD_NS = 18_000_000
-_SET_COMMANDS = frozenset(number for number, _ in codec.CAN_COMMANDS.values())
 _ERPM_PER_STEP_S = 10.0
 """Electrical rpm of a motor whose tachometer counts a step a second."""
-_BRAKE = codec.CAN_COMMANDS["set_brake_current"][0]
+_BRAKE = codec.COMMANDS["set_brake_current"][0]
 
 
 @dataclass(slots=True)
@@ -85,7 +84,7 @@ class _Motor:
         self.turned.speed, self.erpm_ns = erpm / _ERPM_PER_STEP_S, t_ns
 
 
-class VescPort(Port):
+class _VescPort(Port):
     """Port of `VendorDriver` for VESC controllers, which need nothing at rest: released motors roll."""
 
     def __init__(self, settings: declared.VescSettings) -> None:
@@ -105,7 +104,6 @@ class VescPort(Port):
 
     @property
     def seen(self) -> Controllers:
-        """State of the controllers, as received last."""
         timeouts = ((motor.node, motor.timeout) for motor in self._all if motor.timeout is not None)
         refusals = (declared.timeout_fault(self._settings, node, *timeout) for node, timeout in timeouts)
         return Controllers(
@@ -138,7 +136,6 @@ class VescPort(Port):
         return all(motor.erpm_ns is not None and motor.is_stationary for motor in self._all)
 
     def reset_state(self, now_ns: int) -> None:
-        """Clear what the controllers reported."""
         self._pinged_ns = now_ns - _PING_PERIOD_NS
         for motor in self._all:
             motor.answered = motor.timed_out = motor.killed = False
@@ -173,7 +170,6 @@ class VescPort(Port):
         return FrameReport()
 
     def sources(self) -> Sequence[Source]:
-        """Return the speed of every motor."""
         return [Source(f"controller {motor.node}", motor.erpm_ns, SILENT_NS, GONE_NS) for motor in self._all]
 
     def objection(self, permit: MotionPermit) -> Objection | None:
@@ -198,7 +194,6 @@ class VescPort(Port):
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the electrical speed of each motor."""
         limit, commanded = self._settings.max_erpm, (left_rad_s, right_rad_s)
         frames = []
         for side, direction, speed in zip(self._sides, self._settings.direction, commanded, strict=True):
@@ -236,13 +231,17 @@ class VescPort(Port):
             motor.requested_timeout += 1
             return self._request(now_ns, motor, bytes([codec.GET_APPCONF]))
         if polled:
-            return parts.outgoing(now_ns, *declared.questions(self._settings))
+            return parts.outgoing(now_ns, *self._poll())
         self._next_requested = (self._next_requested + 1) % len(self._all)
         return self._request(now_ns, self._all[self._next_requested], codec.request_values(codec.FAULT_AND_STATUS))
 
     def stop_frames(self) -> tuple[Frame, ...]:
-        """Return the frames that brake every motor."""
-        return declared.stop_frames(self._settings)
+        """Return the frames that brake with the declared current, all motors at once; nothing latches it.
+
+        On a serial line they also ask whether the motors stand.
+        """
+        brake = codec.command(codec.EVERYBODY, "set_brake_current", self._settings.brake_current_a)
+        return (brake,) if self._settings.uart_node is None else (brake, *self._poll())
 
     @property
     def _all(self) -> Sequence[_Motor]:
@@ -263,8 +262,13 @@ class VescPort(Port):
             None if complete else "no status messages 1 and 5; switch them on, at 50 Hz (VESC Tool, App Settings, CAN)"
         )
 
+    def _poll(self) -> Sequence[Frame]:
+        """Return the questions for all that must be known of each motor: no status messages come on a serial line."""
+        query = codec.request_values(codec.ALL_OF_A_MOTOR)
+        return [codec.packet_frame(motor.node, declared.HOST_ID, query) for motor in self._all]
+
     def _request(self, now_ns: int, motor: _Motor, payload: bytes) -> tuple[OutgoingFrame, ...]:
-        return parts.outgoing(now_ns, *codec.fragments(motor.node, declared.HOST_ID, payload))
+        return parts.outgoing(now_ns, codec.packet_frame(motor.node, declared.HOST_ID, payload))
 
     def _handle_packet(self, received: ReceivedFrame, permit: MotionPermit) -> FrameReport:
         found = self._reassembly.feed(received.frame)
@@ -295,7 +299,7 @@ class VescPort(Port):
     def _unused(self, frame: Frame) -> FrameReport:
         number, to = frame.can_id >> 8, frame.can_id & 0xFF
         is_addressed = frame.extended and (to in self._motors or to == codec.EVERYBODY)
-        if not (is_addressed and number in _SET_COMMANDS):
+        if not (is_addressed and number in codec.SET_COMMANDS):
             return UNKNOWN
         is_stop = number == _BRAKE
         return FrameReport(counts=("unknown_id",), is_stop=is_stop, commanded=None if is_stop else f"controller {to}")
@@ -307,13 +311,13 @@ def _describe(motor: _Motor) -> str:
 
 DRIVER = MotorDriver(
     "vesc",
-    lambda settings, _key: VendorDriver(VescPort(settings)),
+    lambda settings, _key: VendorDriver(_VescPort(settings)),
     settings=declared.VescSettings,
     example=declared.EXAMPLE,
     recognise=declared.recognise,
     latches_stop=False,
-    stop_frames=declared.stop_frames,
-    stop_confirmation=lambda settings: stop_confirmation(VescPort(settings)),
+    stop_frames=lambda settings: _VescPort(settings).stop_frames(),
+    stop_confirmation=lambda settings: stop_confirmation(_VescPort(settings)),
     cyclic_frames=declared.cyclic_frames,
     safety_card=declared.safety_card,
     kinds=("can", "serial"),

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Meta
 
 from drivers.motor import vesc_codec as codec
-from drivers.motor.vendor_parts import Nodes, Sign, all_of, in_sides, sides_of
+from drivers.motor.vendor_parts import Nodes, Sign, all_of, in_sides, nodes_fault
 from drivers.types import CyclicFrame, Frame, SafetyCard, SettingsFault
 
 # Chosen: unlikely to be a controller's, and refused for one.
@@ -71,22 +71,13 @@ class VescSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     def fault(self) -> SettingsFault | None:
         """Return what is wrong with the fields taken together, or None."""
-        nodes = all_of(self.nodes)
-        if not all(sides_of(self.nodes)):
-            return SettingsFault("nodes", "a side has no controller", "write [left, right], such as [23, 51]")
-        if any(not 0 <= node <= codec.LARGEST_ID or node == HOST_ID for node in nodes):
-            return SettingsFault(
-                "nodes", f"an id is outside 0 to 254, or is {HOST_ID}, the id of this host", "change it"
-            )
-        if len(set(nodes)) != len(nodes):
-            return SettingsFault("nodes", "an id is listed twice", "give each controller an id of its own (VESC Tool)")
-        if self.uart_node is not None and self.uart_node not in nodes:
+        if self.uart_node is not None and self.uart_node not in all_of(self.nodes):
             return SettingsFault(
                 "uart_node", f"{self.uart_node} is not in link.nodes", "write the id of the controller on the line"
             )
         if self.min_erpm >= self.max_erpm:
             return SettingsFault("max_erpm", "not above min_erpm", "write the largest erpm of the motor")
-        return None
+        return nodes_fault(self.nodes, codec.LARGEST_ID, HOST_ID)
 
 
 def slowest_rad_s(settings: VescSettings) -> float:
@@ -131,7 +122,7 @@ class VescExchange:
     def reply(self, frame: Frame, received: bytes) -> Frame | None:
         """Return the first packet that answers this question, of this controller."""
         to, query = frame.can_id & 0xFF, self._payload(frame)
-        for payload in codec.PacketDecoder().feed(received):
+        for payload in codec.packets(received):
             if payload[0] == query[0] == codec.GET_APPCONF and codec.timeout(payload, to) is None:
                 continue
             if payload[0] == codec.GET_VALUES_SELECTIVE:
@@ -151,24 +142,8 @@ class VescExchange:
             return frame.data[2:]
         if number == codec.PING:
             return codec.request_values(codec.ALL_OF_A_MOTOR)
-        name = next(name for name, (command, _) in codec.CAN_COMMANDS.items() if command == number)
         # Both kinds of command have the value in the same steps.
-        return bytes([codec.PACKET_COMMANDS[name][0]]) + frame.data
-
-
-def stop_frames(settings: VescSettings) -> tuple[Frame, ...]:
-    """Return the frames that brake with the declared current, all at once; nothing latches it.
-
-    On a serial line they also ask whether the motors stand.
-    """
-    brake = codec.command(codec.EVERYBODY, "set_brake_current", settings.brake_current_a)
-    return (brake,) if settings.uart_node is None else (brake, *questions(settings))
-
-
-def questions(settings: VescSettings) -> tuple[Frame, ...]:
-    """On a serial line, for all that must be known of each motor; no status messages come there."""
-    query = codec.request_values(codec.ALL_OF_A_MOTOR)
-    return tuple(frame for node in all_of(settings.nodes) for frame in codec.fragments(node, HOST_ID, query))
+        return bytes(in_packet for on_can, in_packet, _ in codec.COMMANDS.values() if on_can == number) + frame.data
 
 
 def cyclic_frames(settings: VescSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:

@@ -16,7 +16,7 @@ from typing import Any
 import msgspec
 
 from drivers.pose import PoseSourceError
-from drivers.pose.senders import SILENCE_S, SenderGate, parse_allowed
+from drivers.pose.senders import SILENCE_S, SenderGate
 from drivers.types import PoseSample
 
 SOURCE = "natnet"
@@ -190,10 +190,7 @@ def create_pose_source(
 
     Raises PoseSourceError for an address or group that cannot be had.
     """
-    try:
-        senders = SenderGate(sender_silence_s, None if allow is None else parse_allowed(allow))
-    except ValueError as error:
-        raise PoseSourceError(f"pose.allow: {error}") from None
+    senders = SenderGate(sender_silence_s, allow)
     opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     opened.setblocking(False)
     try:

@@ -169,16 +169,13 @@ class TangentPlane:
 
     def east_north(self, latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float]:
         """Return the position of a place, east and north (m) of the datum, by geocentric coordinates."""
-        here, datum = _geocentric(latitude_deg, longitude_deg, height_m), _geocentric(*self._datum)
+        here = _geocentric(latitude_deg, longitude_deg, height_m)
+        datum = _geocentric(self.latitude_deg, self.longitude_deg, self.height_m)
         dx, dy, dz = (a - b for a, b in zip(here, datum, strict=True))
         latitude, longitude = math.radians(self.latitude_deg), math.radians(self.longitude_deg)
         outward = math.cos(longitude) * dx + math.sin(longitude) * dy
         east = -math.sin(longitude) * dx + math.cos(longitude) * dy
         return east, -math.sin(latitude) * outward + math.cos(latitude) * dz
-
-    @property
-    def _datum(self) -> tuple[float, float, float]:
-        return self.latitude_deg, self.longitude_deg, self.height_m
 
 
 def _geocentric(latitude_deg: float, longitude_deg: float, height_m: float) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
-from collections.abc import Collection, Hashable, Sequence
+from collections.abc import Collection, Hashable
 from ipaddress import AddressValueError, IPv4Address, IPv4Network, NetmaskValueError
 
 SILENCE_S = 2.0
@@ -22,7 +22,6 @@ CLOCKS_APART_NS = 1_000_000_000
 """A proven datagram was sent at most so long ago, by the sender's clock, or so far ahead of this computer's."""
 # UNIX time in ns as 64-bit integer, and HMAC-SHA-256.
 TIME_BYTES, PROOF_BYTES = 8, 32
-Sender = tuple[str, int]
 
 
 def parse_allowed(addresses: Collection[str]) -> tuple[IPv4Network, ...]:
@@ -62,13 +61,14 @@ class PoseProof:
 class SenderGate:
     """Keeps to one sender: the first whose pose is good, until it has been silent; all others are counted and named.
 
-    `allowed`: networks that may send at all; None for every one. A `sender` is whatever names one, as (address, port).
+    `allow`: addresses and networks that may send at all; None for every one. A `sender` is whatever names one, as
+    (address, port).
     """
 
-    def __init__(self, silence_s: float = SILENCE_S, allowed: Sequence[IPv4Network] | None = None) -> None:
+    def __init__(self, silence_s: float = SILENCE_S, allow: Collection[str] | None = None) -> None:
         self.refused = 0
         self._silence_ns = round(silence_s * 1e9)
-        self._allowed = allowed
+        self._allowed = None if allow is None else parse_allowed(allow)
         self._known: dict[str, bool] = {}
         self._kept: Hashable | None = None
         self._came_ns = 0
@@ -88,7 +88,7 @@ class SenderGate:
                 now_ns, f"{_name(sender)} sends poses but is not in pose.allow", "add it there, or stop that sender"
             )
             return False
-        if self._kept in (None, sender) or self._is_silent(now_ns):
+        if self._kept in (None, sender) or now_ns - self._came_ns >= self._silence_ns:
             return True
         self.refuse(
             now_ns,
@@ -120,9 +120,6 @@ class SenderGate:
         """Return what a person should know since the last call."""
         messages, self._messages = self._messages, []
         return messages
-
-    def _is_silent(self, now_ns: int) -> bool:
-        return now_ns - self._came_ns >= self._silence_ns
 
     def _is_allowed(self, sender: Hashable) -> bool:
         address = sender[0] if isinstance(sender, tuple) else str(sender)

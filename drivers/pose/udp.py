@@ -18,7 +18,7 @@ from typing import Any
 import msgspec
 
 from drivers.pose import PoseSourceError, is_heading_filled_in
-from drivers.pose.senders import SILENCE_S, PoseProof, SenderGate, parse_allowed
+from drivers.pose.senders import SILENCE_S, PoseProof, SenderGate
 from drivers.types import PoseSample
 
 SOURCE = "udp"
@@ -82,16 +82,12 @@ def create_pose_source(
     if key_file and key is None:
         raise PoseSourceError(f"the key of {key_file} was not read; poses without authentication would be accepted")
     try:
-        allowed = None if allow is None else parse_allowed(allow)
-    except ValueError as error:
-        raise PoseSourceError(f"pose.allow: {error}") from None
-    try:
         opened = open_udp_port(address, port)
     except OSError as error:
         reason = error.strerror or str(error)
         raise PoseSourceError(f"{address}:{port}: {reason}; choose another pose.port, or pose.address") from None
     proof = None if key is None else PoseProof(key, time.time_ns())
-    return UdpPoses(opened, SenderGate(sender_silence_s, allowed), proof)
+    return UdpPoses(opened, SenderGate(sender_silence_s, allow), proof)
 
 
 class UdpPoses:

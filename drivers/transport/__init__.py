@@ -14,18 +14,6 @@ from drivers.transport.inprocess import InProcessTransport, connect_pair
 from drivers.transport.reconnecting import ReconnectingTransport, TransportSettingsError
 from drivers.transport.serial import SerialMedium
 
-__all__ = [
-    "CanMedium",
-    "InProcessTransport",
-    "ReconnectingTransport",
-    "SerialMedium",
-    "TransportSettingsError",
-    "connect_pair",
-    "create_transport",
-    "media",
-    "open_transport",
-]
-
 
 @cache
 def media() -> Mapping[str, Callable[..., ReconnectingTransport]]:

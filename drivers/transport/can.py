@@ -30,35 +30,12 @@ from drivers.transport.serial import READ_TIMEOUT_S, WRITE_TIMEOUT_S, error_numb
 from drivers.types import MAX_EXTENDED_ID, Frame, ReceivedFrame
 from firmware_protocol.serial_framing import MAX_CAN_ID, MAX_DATA
 
-# Classes and controller states of an error frame: linux/can/error.h.
-_TX_TIMEOUT = 0x001
-_LOST_ARBITRATION = 0x002
-_CONTROLLER = 0x004
-_PROTOCOL = 0x008
-_TRANSCEIVER = 0x010
-_NO_ACK = 0x020
-_BUS_OFF = 0x040
-_BUS_ERROR = 0x080
-_RESTARTED = 0x100
-_COUNTERS = 0x200
-_CLASSES = (
-    (_TX_TIMEOUT, "transmit timeout"),
-    (_LOST_ARBITRATION, "arbitration lost"),
-    (_PROTOCOL, "protocol violation"),
-    (_TRANSCEIVER, "transceiver fault (wiring)"),
-    (_NO_ACK, "no acknowledgement: no other node is on the bus, or it uses another bit rate"),
-    (_BUS_ERROR, "bus error"),
-)
-_CONTROLLER_STATES = (
-    (0x01, "receive overflow in the controller"),
-    (0x02, "transmit overflow in the controller"),
-    (0x04, "receive errors at warning level"),
-    (0x08, "transmit errors at warning level"),
-    (0x10, "receive errors at passive level"),
-    (0x20, "transmit errors at passive level"),
-)
-# CAN_ERR_CRTL_RX_OVERFLOW of linux/can/error.h.
-_RECEIVE_OVERFLOW = 0x01
+# Classes of an error frame (linux/can/error.h). Of the errors among them: transmit timeout, lost arbitration, protocol
+# violation, transceiver fault, no acknowledgement, bus error.
+_ERROR_CLASSES = 0x001 | 0x002 | 0x008 | 0x010 | 0x020 | 0x080
+_CONTROLLER_CLASS, _BUS_OFF_CLASS = 0x004, 0x040
+# States of the controller in its second byte; above the errors is only that it is active again.
+_CONTROLLER_ERRORS, _RECEIVE_OVERFLOW = 0x3F, 0x01
 # Chosen: longer than a frame waits for a loaded bus; until then an equal frame of another host counts as the echo.
 ECHO_NS = 1_000_000_000
 # Of a bus whose library or system is not here; where a library was not loaded, some of python-can use it all the same.
@@ -175,12 +152,41 @@ class CanMedium:
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
+        number = error_number(error)
+        text = plain(error)
         if isinstance(error, LinkMuteError):
             where = "the adapter (its number may have changed: use its name in /dev/serial/by-id)"
-            return f"{self.name}: {error}; check the robot's power, the bit rate and {where}"
-        if isinstance(error, LinkLostError):
-            return f"{self.name}: {error}"
-        return explain_can(self.interface, self.channel, self.bitrate, error)
+            text = f"{error}; check the robot's power, the bit rate and {where}"
+        elif isinstance(error, LinkLostError):
+            text = str(error)
+        elif isinstance(error, TypeError):
+            text = f"link.options do not fit this interface ({error}); correct them"
+        elif isinstance(error, _NOT_HERE):
+            text = f"cannot be used here ({text}); install its maker's driver, or use another interface"
+        elif type(error).__name__ == "NoBackendError":
+            text = "libusb is missing; run: sudo apt-get install libusb-1.0-0"
+        elif self.interface == "socketcan" and number in (hints := self._socketcan_hints()):
+            text = hints[number]
+        elif self.interface in _OVER_A_TTY and number is not None:
+            return explain_port(self.channel, error)
+        elif number in (errno.ENOENT, errno.ECONNREFUSED):
+            text = "nothing listens there; start the other end first"
+        return f"{self.name}: {text}"
+
+    def _socketcan_hints(self) -> Mapping[int | None, str]:
+        bring_up = f"sudo ip link set {self.channel} up"
+        if self.channel.startswith("vcan"):
+            create = f"run: sudo ip link add dev {self.channel} type vcan && {bring_up}"
+        else:
+            bring_up += f" type can bitrate {self.bitrate}"
+            create = f"plug the adapter in and run: {bring_up}"
+        check = f"check that another node is on the bus (ip -details link show {self.channel})"
+        return {
+            errno.ENODEV: f"no such CAN interface; {create}",
+            errno.ENETDOWN: f"the interface is down; run: {bring_up}",
+            errno.EAFNOSUPPORT: "this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface",
+            errno.ENOBUFS: f"transmit queue full; {check}",
+        }
 
 
 class CanConnection:
@@ -267,14 +273,12 @@ class CanConnection:
             ) from error
 
     def _handle_error_frame(self, message: can.Message) -> None:
-        bus_error = decode_error_frame(message.arbitration_id, bytes(message.data))
-        self._counters.add(
-            bus_off=int(bus_error.bus_off),
-            bus_errors=int(bus_error.harmful and not bus_error.bus_off),
-            receive_overflow=int(bus_error.receive_overflow),
-        )
-        if bus_error.bus_off:
-            raise LinkLostError(f"{bus_error.text}; check wiring, termination and bit rate")
+        counts = error_counts(message.arbitration_id, bytes(message.data))
+        self._counters.add(**counts)
+        if counts["bus_off"]:
+            raise LinkLostError(
+                "bus-off: the controller has left the bus after too many errors; check wiring, termination and bit rate"
+            )
 
 
 def monotonic_stamp_ns(timestamp_s: float, wall_now_ns: int, now_ns: int) -> int:
@@ -331,38 +335,6 @@ def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")
         )
 
 
-def explain_can(interface: str, channel: str, bitrate: int, error: BaseException) -> str:
-    """Say what went wrong with a CAN bus and what to do about it."""
-    number = error_number(error)
-    where = f"{interface} {channel}"
-    if isinstance(error, TypeError):
-        return f"{where}: link.options do not fit this interface ({error}); correct them"
-    if isinstance(error, _NOT_HERE):
-        return f"{where}: cannot be used here ({plain(error)}); install its maker's driver, or use another interface"
-    if type(error).__name__ == "NoBackendError":
-        return f"{where}: libusb is missing; run: sudo apt-get install libusb-1.0-0"
-    if interface == "socketcan":
-        virtual = channel.startswith("vcan")
-        bring_up = f"sudo ip link set {channel} up" + ("" if virtual else f" type can bitrate {bitrate}")
-        if number == errno.ENODEV and virtual:
-            return f"{where}: no such CAN interface; run: sudo ip link add dev {channel} type vcan && {bring_up}"
-        if number == errno.ENODEV:
-            return f"{where}: no such CAN interface; plug the adapter in and run: {bring_up}"
-        if number == errno.ENETDOWN:
-            return f"{where}: the interface is down; run: {bring_up}"
-        if number == errno.EAFNOSUPPORT:
-            return f"{where}: this kernel has no CAN; load it with: sudo modprobe can_raw, or use another interface"
-        if number == errno.ENOBUFS:
-            return (
-                f"{where}: transmit queue full; check that another node is on the bus (ip -details link show {channel})"
-            )
-    if interface in _OVER_A_TTY and number is not None:
-        return explain_port(channel, error)
-    if number in (errno.ENOENT, errno.ECONNREFUSED):
-        return f"{where}: nothing listens there; start the other end first"
-    return f"{where}: {plain(error)}"
-
-
 class SentFrames:
     """For buses that hand a sender its own frames; a sending and a receiving thread may use it at once.
 
@@ -403,39 +375,16 @@ class SentFrames:
             self._sent.popleft()
 
 
-@dataclass(frozen=True, slots=True)
-class CanBusError:
-    """One error frame in words; the error counters are None where the adapter does not report them."""
+def error_counts(error_class: int, data: bytes) -> dict[str, int]:
+    """Return the transport's counters of an error frame's class bits (its identifier) and data of any length.
 
-    bus_off: bool
-    harmful: bool
-    receive_overflow: bool
-    text: str
-    tx_error_count: int | None
-    rx_error_count: int | None
-
-
-def decode_error_frame(error_class: int, data: bytes) -> CanBusError:
-    """Return the meaning of an error frame from its class bits (its identifier) and data; any length is accepted.
-
-    `harmful` is False for what only reports a recovery (controller active again, restarted) or counters.
+    What only reports a recovery (controller active again, restarted) or its own counters is no bus error.
     """
-    detail = data.ljust(8, b"\0")
-    controller = detail[1] if error_class & _CONTROLLER else 0
-    texts = [text for bit, text in _CLASSES if error_class & bit]
-    texts += [text for bit, text in _CONTROLLER_STATES if controller & bit]
-    bus_off = bool(error_class & _BUS_OFF)
-    if bus_off:
-        texts.insert(0, "bus-off: the controller has left the bus after too many errors")
-    harmful = bool(texts)
-    if error_class & _RESTARTED:
-        texts.append("controller restarted")
-    counted = bool(error_class & _COUNTERS)
-    return CanBusError(
-        bus_off=bus_off,
-        harmful=harmful,
-        receive_overflow=bool(controller & _RECEIVE_OVERFLOW),
-        text=", ".join(texts) or "controller is error-active",
-        tx_error_count=detail[6] if counted else None,
-        rx_error_count=detail[7] if counted else None,
-    )
+    controller = data[1] if error_class & _CONTROLLER_CLASS and len(data) > 1 else 0
+    is_bus_off = bool(error_class & _BUS_OFF_CLASS)
+    is_error = bool(error_class & _ERROR_CLASSES or controller & _CONTROLLER_ERRORS)
+    return {
+        "bus_off": int(is_bus_off),
+        "bus_errors": int(is_error and not is_bus_off),
+        "receive_overflow": int(bool(controller & _RECEIVE_OVERFLOW)),
+    }

@@ -20,40 +20,20 @@ class InProcessTransport:
     """
 
     def __init__(self, name: str) -> None:
-        self._name = name
+        self.name = name
         self._counters = TransportCounters()
         self._peer: InProcessTransport | None = None
         self._open = False
         self._plugged = True
-        self._state = LinkState.CLOSED
-        self._generation = 0
-        self._last_error: str | None = None
+        self.state = LinkState.CLOSED
+        self.generation = 0
+        self.last_error: str | None = None
         self._incoming: deque[ReceivedFrame] = deque()
-
-    @property
-    def name(self) -> str:
-        """Name given to this end."""
-        return self._name
-
-    @property
-    def state(self) -> LinkState:
-        """Whether frames can be carried now."""
-        return self._state
-
-    @property
-    def generation(self) -> int:
-        """Number of times the link has come up."""
-        return self._generation
 
     @property
     def stats(self) -> TransportStats:
         """A snapshot of the counters."""
         return self._counters.snapshot()
-
-    @property
-    def last_error(self) -> str | None:
-        """The newest error in words, or None if there was none since the link last came up."""
-        return self._last_error
 
     def open(self) -> None:
         """Connect as soon as the other end is open too."""
@@ -77,7 +57,7 @@ class InProcessTransport:
         if outgoing.deadline_ns < now_ns:
             self._counters.add(expired=1)
             return False
-        if self._state is not LinkState.UP or self._peer is None:
+        if self.state is not LinkState.UP or self._peer is None:
             self._counters.add(send_errors=1)
             return False
         self._counters.add(frames_sent=1)
@@ -104,15 +84,15 @@ class InProcessTransport:
 
     def _settle(self) -> None:
         up = self._open and self._plugged and self._peer is not None and self._peer._open
-        if up and self._state is not LinkState.UP:
-            self._generation += 1
-            self._last_error = None
-            self._counters.add(reconnects=int(self._generation > 1))
+        if up and self.state is not LinkState.UP:
+            self.generation += 1
+            self.last_error = None
+            self._counters.add(reconnects=int(self.generation > 1))
         if not up:
             self._incoming.clear()
-            if self._state is LinkState.UP and self._open:
-                self._last_error = f"{self._name}: unplugged"
-        self._state = LinkState.UP if up else LinkState.CONNECTING if self._open else LinkState.CLOSED
+            if self.state is LinkState.UP and self._open:
+                self.last_error = f"{self.name}: unplugged"
+        self.state = LinkState.UP if up else LinkState.CONNECTING if self._open else LinkState.CLOSED
 
 
 def connect_pair() -> tuple[InProcessTransport, InProcessTransport]:

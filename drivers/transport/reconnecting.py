@@ -66,8 +66,6 @@ class TransmitQueue:
     When it is full a more urgent frame takes the place of the least urgent one, so that an emergency stop always fits.
     """
 
-    __slots__ = ("_capacity", "_front", "_heap", "_sequence")
-
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._heap: list[tuple[int, int, OutgoingFrame]] = []
@@ -122,8 +120,6 @@ def _rank(outgoing: OutgoingFrame) -> int:
 
 class TransportCounters:
     """The counters of one transport, named as the fields of `TransportStats`."""
-
-    __slots__ = ("_counts", "_lock")
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -191,7 +187,8 @@ class ReconnectingTransport:
     """A `drivers.types.Transport` over any medium, which it connects again with back-off whenever it is lost.
 
     Whatever waits to be sent when the link is lost is dropped: nothing old is ever sent on a new link. A frame leaves
-    in the order of `TransmitQueue`, and is dropped when its deadline has passed or when it does not fit the queue.
+    in the order of `TransmitQueue`, and is dropped when its deadline has passed or when it does not fit the queue. That
+    a link was mute, and so was connected again, stays its `last_error` until a frame comes.
     """
 
     def __init__(
@@ -211,6 +208,7 @@ class ReconnectingTransport:
         none, but packets of up to 512 bytes.
         """
         self._medium = medium
+        self.name = medium.name
         self._largest = (
             MAX_EXTENDED_ID if carries_packets else MAX_CAN_ID,
             MAX_EXTENDED_ID if carries_extended or carries_packets else -1,
@@ -223,9 +221,9 @@ class ReconnectingTransport:
         self._counters = TransportCounters()
         self._changed = threading.Condition()
         self._writing = threading.Lock()
-        self._state = LinkState.CLOSED
-        self._generation = 0
-        self._last_error: str | None = None
+        self.state = LinkState.CLOSED
+        self.generation = 0
+        self.last_error: str | None = None
         self._connection: Connection | None = None
         self._outgoing = TransmitQueue(TRANSMIT_CAPACITY)
         self._sending = False
@@ -235,32 +233,9 @@ class ReconnectingTransport:
         self._threads: tuple[threading.Thread, ...] = ()
 
     @property
-    def name(self) -> str:
-        """Medium and address, for messages to the operator."""
-        return self._medium.name
-
-    @property
-    def state(self) -> LinkState:
-        """Whether frames can be carried now."""
-        return self._state
-
-    @property
-    def generation(self) -> int:
-        """Number of times the link has come up."""
-        return self._generation
-
-    @property
     def stats(self) -> TransportStats:
         """A snapshot of the counters."""
         return self._counters.snapshot()
-
-    @property
-    def last_error(self) -> str | None:
-        """The newest error with its remedy, or None if there was none since the link last came up.
-
-        That it was mute, and so was connected again, is said until a frame comes.
-        """
-        return self._last_error
 
     def open(self) -> None:
         """Start both threads and the first connection attempt; return at once.
@@ -269,7 +244,7 @@ class ReconnectingTransport:
         """
         if self._threads or self._stop.is_set():
             return
-        self._state = LinkState.CONNECTING
+        self.state = LinkState.CONNECTING
         self._threads = (
             threading.Thread(target=self._run_receiver, name=f"{self.name} receive", daemon=True),
             threading.Thread(target=self._run_sender, name=f"{self.name} send", daemon=True),
@@ -289,7 +264,7 @@ class ReconnectingTransport:
             self._counters.add(expired=1)
             return False
         with self._changed:
-            if self._state is not LinkState.UP:
+            if self.state is not LinkState.UP:
                 self._counters.add(send_errors=1)
                 return False
             dropped = self._outgoing.push(outgoing)
@@ -314,7 +289,7 @@ class ReconnectingTransport:
         for thread in self._threads:
             thread.join(_JOIN_S)
         self._threads = ()
-        self._state = LinkState.CLOSED
+        self.state = LinkState.CLOSED
 
     def _run_receiver(self) -> None:
         delay_s: float | None = None
@@ -343,7 +318,7 @@ class ReconnectingTransport:
             except Exception as error:  # whatever a backend raises, this thread must outlive it
                 self._counters.add(receive_errors=1)
                 self._note(error)
-                self._mute_reason = self._last_error if isinstance(error, LinkMuteError) else None
+                self._mute_reason = self.last_error if isinstance(error, LinkMuteError) else None
                 return
             if frames:
                 received_ns = time.monotonic_ns()
@@ -361,7 +336,7 @@ class ReconnectingTransport:
 
     def _deliver(self, frames: Sequence[ReceivedFrame]) -> None:
         if self._mute_reason is not None:
-            self._last_error = self._mute_reason = None
+            self.last_error = self._mute_reason = None
         self._patience_s = self._mute_after_s
         with self._changed:
             self._incoming.extend(frames)
@@ -381,16 +356,16 @@ class ReconnectingTransport:
             self._incoming.clear()
             self._connection = connection
             # That it was mute is worth saying until it is not.
-            self._last_error = self._mute_reason
+            self.last_error = self._mute_reason
             # Counted before it shows, so that nobody sees a link that came back and was not counted.
-            self._counters.add(reconnects=1 if self._generation else 0)
-            self._generation += 1
-            self._state = LinkState.UP
+            self._counters.add(reconnects=1 if self.generation else 0)
+            self.generation += 1
+            self.state = LinkState.UP
             self._changed.notify_all()
 
     def _go_down(self, connection: Connection) -> None:
         with self._changed:
-            self._state = LinkState.CONNECTING
+            self.state = LinkState.CONNECTING
             self._connection = None
             dropped = self._outgoing.clear()
             self._changed.notify_all()
@@ -399,7 +374,7 @@ class ReconnectingTransport:
             try:
                 connection.close()
             except Exception as error:  # a device that is gone cannot be closed properly either
-                if self._last_error is None:
+                if self.last_error is None:
                     self._note(error)
 
     def _run_sender(self) -> None:
@@ -451,4 +426,4 @@ class ReconnectingTransport:
         return True
 
     def _note(self, error: Exception) -> None:
-        self._last_error = self._medium.explain(error)
+        self.last_error = self._medium.explain(error)

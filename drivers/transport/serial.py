@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import errno
 import fcntl
 import queue
@@ -91,7 +92,12 @@ class SerialMedium:
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
-        return explain_mute(self.port, error) if isinstance(error, LinkMuteError) else explain_port(self.port, error)
+        if isinstance(error, LinkMuteError):
+            return (
+                f"{self.port}: {error}; check that the robot is switched on and that this is its port. The numbers of "
+                "adapters change: use the name in /dev/serial/by-id. Some USB boards send only with link.dtr = true"
+            )
+        return explain_port(self.port, error)
 
 
 class SerialConnection:
@@ -218,7 +224,7 @@ class SocketPort(protocol_socket.Serial):  # type: ignore[misc]  # pyserial has 
     _socket: socket.socket | None
 
     def open(self) -> None:
-        """Connect to the socket of the line; raises `serial.SerialException`. Raises `serial.SerialException`."""
+        """Connect to the socket of the line. Raises `serial.SerialException`."""
         if not self.portstr.startswith(_UNIX):
             super().open()
             return
@@ -266,14 +272,9 @@ def open_port(medium: SerialMedium, *, timeout_s: float, write_timeout_s: float,
 
 def request_low_latency(port: serial.Serial) -> None:
     """Ask for delivery byte by byte: FTDI adapters otherwise hold received bytes back for 16 ms."""
-    request = getattr(port, "set_low_latency_mode", None)
-    if request is None:
-        return
-    try:
-        request(True)
-    except (ValueError, OSError, NotImplementedError):
-        # Pseudo-terminals, CDC-ACM and network ports have no such mode, and no latency timer either.
-        return
+    # Pseudo-terminals, CDC-ACM and network ports have no such mode, and no latency timer either.
+    with contextlib.suppress(AttributeError, ValueError, OSError, NotImplementedError):
+        port.set_low_latency_mode(True)
 
 
 def error_number(error: BaseException) -> int | None:
@@ -300,14 +301,6 @@ def explain_port(port: str, error: BaseException) -> str:
     if number in (errno.EBUSY, errno.EAGAIN) or "exclusively lock" in str(error):
         return f"{port}: in use by another program; stop it (sudo fuser {port} shows which)"
     return f"{port}: {plain(error)}"
-
-
-def explain_mute(port: str, error: BaseException) -> str:
-    """Say what to look at when a serial port is open and nothing comes from it."""
-    return (
-        f"{port}: {error}; check that the robot is switched on and that this is its port. The numbers of adapters "
-        "change: use the name in /dev/serial/by-id. Some USB boards send only with link.dtr = true"
-    )
 
 
 def plain(error: BaseException) -> str:

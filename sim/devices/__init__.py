@@ -18,5 +18,5 @@ def find_controller(driver: str) -> Callable[[Any, int], Controller] | None:
     name = f"{__name__}.{driver}"
     if not driver.isidentifier() or find_spec(name) is None:
         return None
-    made: Callable[[Any, int], Controller] | None = getattr(import_module(name), "create_controller", None)
+    made: Callable[[Any, int], Controller] | None = getattr(import_module(name), "CONTROLLER", None)
     return made

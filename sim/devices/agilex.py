@@ -219,6 +219,4 @@ class AgilexController:
         self.base = AgilexBase()
 
 
-def create_controller(settings: AgilexSettings, ticks_per_rev: int) -> AgilexController:
-    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
-    return AgilexController(settings, ticks_per_rev)
+CONTROLLER = AgilexController

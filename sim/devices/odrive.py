@@ -422,6 +422,4 @@ class OdriveController:
         return [by_node[node] for node in left], [by_node[node] for node in right]
 
 
-def create_controller(settings: OdriveSettings, ticks_per_rev: int) -> OdriveController:
-    """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
-    return OdriveController(settings, ticks_per_rev)
+CONTROLLER = OdriveController

@@ -80,7 +80,7 @@ class Roboclaw:
         while len(self._pending) >= 2:
             address, command = self._pending[0], self._pending[1]
             if command in _SETTERS:
-                body, act = _SETTERS[command]
+                body = _SETTERS[command]
                 length = 2 + struct.calcsize(">" + body) + 2
                 if len(self._pending) < length:
                     break
@@ -94,7 +94,7 @@ class Roboclaw:
                     arguments = struct.unpack(">" + body, packet[2:-2])
                     self._feed(now_us)
                     self.obeyed.append((command, arguments))
-                    act(self, arguments)
+                    self._obey(command, arguments)
                     out += b"\xff"
             elif command in _GETTERS:
                 del self._pending[:2]
@@ -125,46 +125,38 @@ class Roboclaw:
         speeds[motor] = speed
         self._drive("speed", *speeds)
 
-    def _set_timeout(self, arguments: tuple[int, ...]) -> None:
-        self.registers.timeout_ds = arguments[0]
+    def _obey(self, command: int, arguments: tuple[int, ...]) -> None:
+        registers, a = self.registers, arguments
+        match command:
+            case 14:
+                registers.timeout_ds = a[0]
+            case 20:
+                registers.encoder_m1 = registers.encoder_m2 = 0
+            case 28:
+                registers.pid_m1 = (a[1], a[2], a[0], a[3])
+            case 29:
+                registers.pid_m2 = (a[1], a[2], a[0], a[3])
+            case 34:
+                self._drive("duty", a[0], a[1])
+            case 35 | 36:
+                self._drive_one(command - 35, a[0])
+            case 37:
+                self._drive("speed", a[0], a[1])
+            case 40:
+                self._drive("speed", a[1], a[2], a[0])
+            case 94:
+                registers.nvm_writes += a[0] == 0xE22EAB7A
+            case 200 if registers.estop_lock == 0xAA:
+                registers.status &= ~1
+            case 201:
+                registers.estop_lock = a[0]
 
-    def _reset_encoders(self, _arguments: tuple[int, ...]) -> None:
-        self.registers.encoder_m1 = self.registers.encoder_m2 = 0
 
-    def _set_pid_m1(self, arguments: tuple[int, ...]) -> None:
-        d, p, i, qpps = arguments
-        self.registers.pid_m1 = (p, i, d, qpps)
-
-    def _set_pid_m2(self, arguments: tuple[int, ...]) -> None:
-        d, p, i, qpps = arguments
-        self.registers.pid_m2 = (p, i, d, qpps)
-
-    def _write_nvm(self, arguments: tuple[int, ...]) -> None:
-        self.registers.nvm_writes += arguments[0] == 0xE22EAB7A
-
-    def _reset_estop(self, _arguments: tuple[int, ...]) -> None:
-        if self.registers.estop_lock == 0xAA:
-            self.registers.status &= ~1
-
-    def _set_estop_lock(self, arguments: tuple[int, ...]) -> None:
-        self.registers.estop_lock = arguments[0]
-
-
-_Act = Callable[[Roboclaw, tuple[int, ...]], None]
-_SETTERS: dict[int, tuple[str, _Act]] = {
-    14: ("B", Roboclaw._set_timeout),
-    20: ("", Roboclaw._reset_encoders),
-    28: ("IIII", Roboclaw._set_pid_m1),
-    29: ("IIII", Roboclaw._set_pid_m2),
-    34: ("hh", lambda board, a: board._drive("duty", a[0], a[1])),
-    35: ("i", lambda board, a: board._drive_one(0, a[0])),
-    36: ("i", lambda board, a: board._drive_one(1, a[0])),
-    37: ("ii", lambda board, a: board._drive("speed", a[0], a[1])),
-    40: ("Iii", lambda board, a: board._drive("speed", a[1], a[2], a[0])),
-    94: ("I", Roboclaw._write_nvm),
-    200: ("", Roboclaw._reset_estop),
-    201: ("B", Roboclaw._set_estop_lock),
-}
+_SETTERS = {
+    14: "B", 20: "", 28: "IIII", 29: "IIII", 34: "hh", 35: "i", 36: "i", 37: "ii", 40: "Iii",
+    94: "I", 200: "", 201: "B",
+}  # fmt: skip
+"""By command: how its arguments are packed. Those of a velocity PID are D, P, I, QPPS."""
 
 
 def _counts(*values: int) -> bytes:
@@ -304,6 +296,4 @@ class RoboclawController:
 _MOVING = frozenset({34, 35, 36, 37, 40})
 
 
-def create_controller(settings: RoboclawSettings, ticks_per_rev: int) -> RoboclawController:
-    """Return the boards of a robot whose robot.toml has these settings."""
-    return RoboclawController(settings, ticks_per_rev)
+CONTROLLER = RoboclawController

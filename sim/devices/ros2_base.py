@@ -22,7 +22,7 @@ WHEELS_MS, STATE_MS, STEP_MS = 20, 50, 20
 class Ros2BaseController:
     """Controller of a base on ROS 2 (a `sim.virtual_robot.Controller`).
 
-    `joints`: whether the base reports each wheel. `joints`: whether the base says how all of its wheels turn.
+    `joints`: whether the base says how each of its wheels turns.
     """
 
     brakes = False
@@ -97,6 +97,4 @@ class Ros2BaseController:
             self._speeds, self._set_ms, self.obeyed = speeds, now_ms, self.obeyed + 1
 
 
-def create_controller(settings: wire.Ros2BaseSettings, ticks_per_rev: int) -> Ros2BaseController:
-    """Return the base of a robot whose robot.toml has these settings, with the encoder on the wheel."""
-    return Ros2BaseController(settings, ticks_per_rev)
+CONTROLLER = Ros2BaseController

@@ -139,6 +139,4 @@ def _brakes(vesc: Vesc) -> bool:
     return name == "set_brake_current" and value > 0.0 and not vesc.values.fault
 
 
-def create_controller(settings: VescSettings, ticks_per_rev: int) -> VescController:
-    """Return the controllers of a robot whose robot.toml has these settings, with the encoder on the wheel."""
-    return VescController(settings, ticks_per_rev)
+CONTROLLER = VescController

@@ -41,8 +41,7 @@ def truth(robot):
 
 def changed(plant, **fields):
     """Continue the same plant as another robot from now on."""
-    other = ForeignPlant(replace(plant.robot, **fields), plant.pose, 1)
-    plant.robot, plant._numbers = other.robot, other._numbers
+    plant.become(replace(plant.robot, **fields))
 
 
 @pytest.mark.parametrize("count", [3, pytest.param(6, marks=pytest.mark.thorough)])

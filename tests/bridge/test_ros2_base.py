@@ -203,7 +203,7 @@ class TestBaseEnd:
 
     def test_an_estop_is_held_with_zeros_until_it_is_reset(self, end):
         end.receive(0, wire.enable(True))
-        (stop,) = wire.stop_frames(settings())
+        stop = Frame(wire.STOP, b"")
         assert end.receive(0, stop) == (0.0, 0.0)
         for now_ms in (1000, 100_000):
             end.receive(now_ms * MS, wire.enable(True))

@@ -16,8 +16,8 @@ from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
+from tests.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from tests.tasks import costs
-from tools.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 POINTS, WEIGHTS = unscented_points(MODEL, 1.0)

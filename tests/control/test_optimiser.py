@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control.kernel import BLOCK
+from disco_hw.control.kernel.step import LEAST, NOMINAL, TEMPERATURE, VALID
 from disco_hw.control.optimiser import FIRST_TEMPERATURE, Optimiser
 from disco_hw.control.pendulum import LARGEST_TORQUE_NM, PAPER_SAMPLER, STEP_S, PendulumTerms
 
@@ -34,11 +35,11 @@ def test_steps_lower_the_cost_of_the_plan():
     reports = []
     for _ in range(30):
         assert found.step(0.0, 1.0, (0.0,), pendulum(), WEIGHTS)
-        reports.append(found.report())
-    assert reports[-1]["cost_nominal"] < 0.97 * reports[0]["cost_nominal"]
-    assert reports[-1]["cost_min"] <= reports[-1]["cost_nominal"] <= reports[0]["cost_nominal"]
+        reports.append(found.work.report.copy())
+    assert reports[-1][NOMINAL] < 0.97 * reports[0][NOMINAL]
+    assert reports[-1][LEAST] <= reports[-1][NOMINAL] <= reports[0][NOMINAL]
     assert found.ess == pytest.approx(10.0, rel=0.02)
-    assert reports[-1]["valid_samples"] == SAMPLES
+    assert reports[-1][VALID] == SAMPLES
 
 
 def test_random_numbers_depend_on_seed_and_step_number_alone():
@@ -71,7 +72,7 @@ def test_the_plan_is_a_copy_and_can_be_set_and_forgotten():
     np.testing.assert_allclose(plan, wanted, atol=1e-6)
     found.reset()
     assert not found.nominal().any()
-    assert found.report()["temperature"] == FIRST_TEMPERATURE
+    assert found.work.report[TEMPERATURE] == FIRST_TEMPERATURE
 
 
 def test_a_gain_below_one_moves_the_plan_that_part_of_the_way():
@@ -124,7 +125,7 @@ def test_nothing_valid_leaves_the_plan_and_is_told():
     found.set_nominal(np.full((T, 1), 0.5))
     assert not found.step(0.0, 1.0, (0.0,), pendulum(math.nan), WEIGHTS)
     np.testing.assert_array_equal(found.nominal(), np.full((T, 1), 0.5))
-    assert found.report()["valid_samples"] == 0
+    assert found.work.report[VALID] == 0
     commands, weights = found.sampled_commands(10)
     assert commands.shape == (0, T, 1)
     assert weights.size == 0

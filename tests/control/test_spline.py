@@ -17,8 +17,3 @@ def test_basis_is_that_of_a_clamped_cubic_spline(knots, horizon):
     vector = np.r_[0, 0, 0, np.linspace(0, 1, knots - 2), 1, 1, 1]
     expected = BSpline(vector, control, 3)((np.arange(horizon) + 0.5) / horizon)
     np.testing.assert_allclose((weights * control[first[:, None] + np.arange(4)]).sum(axis=1), expected, atol=1e-12)
-
-
-def test_too_few_knots_are_refused():
-    with pytest.raises(ValueError, match="at least 4 knots, not 3"):
-        spline_basis(3, 50)

@@ -7,8 +7,9 @@ import pytest
 
 from disco_hw.config import Estimation
 from disco_hw.estimation.correction import Measurement, PoseReason, gate_limit
-from disco_hw.estimation.filter import MAX_EXTRAPOLATION_S, PoseFilter
+from disco_hw.estimation.filter import HeadingSearch, PoseFilter
 from disco_hw.estimation.odometry import OdometryParameters, Pose, WheelReading, advance
+from disco_hw.model.coefficients import Disturbance
 
 PARAMETERS = OdometryParameters(0.061, 0.415, 0.238)
 SETTINGS = Estimation(gate_lockout_count=5)
@@ -52,12 +53,28 @@ def test_the_first_pose_sets_the_belief():
 
 def test_where_no_pose_is_required_odometry_starts_at_the_origin_until_the_first_pose():
     pose_filter, state = started(Estimation(pose_required=False))
+    np.testing.assert_allclose(state.belief.covariance, 1e-6 * np.eye(3), rtol=1e-9)
     state = pose_filter.move(state, 10**9, 10.0, 10.0, False)
     assert state.belief.x_m == pytest.approx(0.61)
     assert state.pose_t_ns is None
     state = pose_filter.fuse(state, measured(10**9, 5.0, 5.0, 1.0))
     assert state.evaluation.reason is PoseReason.INITIALISED
     assert state.belief.pose == Pose(5.0, 5.0, 1.0)
+    assert state.reinitialisations == 1
+
+
+def test_a_first_pose_to_which_odometry_from_the_origin_has_led_is_no_jump():
+    pose_filter, state = started(Estimation(pose_required=False))
+    state = pose_filter.fuse(state, measured(0, 0.005, 0.005, 0.01))
+    assert (state.evaluation.reason, state.reinitialisations) == (PoseReason.INITIALISED, 0)
+
+
+def test_the_first_pose_of_a_sensor_that_is_mounted_aside_sets_the_robot_beside_it():
+    pose_filter, state = started()
+    # Heading along y: what is ahead lies at larger y, what is to the left at smaller x.
+    aside = Measurement(0, Pose(1.0, 2.0, 0.5 * math.pi), 1e-4, 4e-4, False, 0.3, -0.2)
+    belief = pose_filter.fuse(state, aside).belief
+    assert (belief.x_m, belief.y_m, belief.yaw_rad) == pytest.approx((1.0 - 0.2, 2.0 - 0.3, 0.5 * math.pi))
 
 
 def test_the_gate_opens_at_its_limit():
@@ -73,6 +90,37 @@ def test_the_gate_opens_at_its_limit():
     assert outside.evaluation.distance2 == pytest.approx(1.001**2 * gate_limit(0.999), rel=1e-4)
     assert outside.belief == state.belief
     assert outside.pose_t_ns == 0
+
+
+@pytest.mark.parametrize(("std_rad", "is_known"), [(0.29, True), (0.31, False)])
+def test_a_heading_is_known_up_to_a_standard_deviation_of_0_3_rad(std_rad, is_known):
+    pose_filter, state = started()
+    found = pose_filter.fuse(state, Measurement(0, Pose(0.0, 0.0, 0.0), 1e-4, std_rad**2, False))
+    assert (found.heading_known, isinstance(found.belief, HeadingSearch)) == (is_known, not is_known)
+
+
+def test_a_heading_is_forgotten_where_the_wheels_turn_the_robot_unmeasured():
+    pose_filter, state = initialised()
+    spins = WheelReading(0, 0.0, 0.0, -5.0, 5.0)
+    assert pose_filter.extrapolate(state, spins, 200_000_000).heading_known
+    assert not pose_filter.extrapolate(state, spins, 2 * 10**9).heading_known
+
+
+def test_of_each_source_the_last_accepted_stamp_is_kept():
+    pose_filter, state = initialised()
+    for t_ns, source in ((1, 1), (2, 0), (3, 1)):
+        state = pose_filter.fuse(state, Measurement(t_ns, Pose(0.0, 0.0, 0.0), 1e-4, 4e-4, False, source=source))
+    assert dict(state.accepted) == {0: 2, 1: 3}
+    assert len(state.accepted) == 2
+
+
+def test_for_a_position_alone_the_gate_is_that_of_two_numbers():
+    pose_filter, state = initialised()
+    # Chi-square with two degrees of freedom exceeds -2 ln(0.001) once in a thousand times.
+    edge = math.sqrt(-2.0 * math.log(0.001) * 2e-4)
+    for part, reason in ((0.999, PoseReason.ACCEPTED), (1.001, PoseReason.GATED)):
+        place = Measurement(0, Pose(part * edge, 0.0, 0.0), 1e-4, None, False)
+        assert pose_filter.fuse(state, place).evaluation.reason is reason
 
 
 def test_outliers_that_disagree_never_move_the_belief():
@@ -148,7 +196,7 @@ def test_extrapolation_keeps_the_speed_for_a_bounded_time_and_doubts_it_for_long
     near = pose_filter.extrapolate(state, wheels, 100_000_000)
     expected = advance(PARAMETERS, Pose(0.0, 0.0, 0.0), [(5.0, 6.0, 0.1)])
     assert (near.belief.x_m, near.belief.yaw_rad) == pytest.approx((expected.x_m, expected.yaw_rad))
-    current = pose_filter.extrapolate(state, wheels, round(MAX_EXTRAPOLATION_S * 1e9))
+    current = pose_filter.extrapolate(state, wheels, 200_000_000)
     later = pose_filter.extrapolate(state, wheels, 2 * 10**9)
     assert later.belief.pose == current.belief.pose
     # Without the slip of the moved part, a quarter of all the path there may have been: 0.061 * 5.5 * 2 s.
@@ -163,3 +211,23 @@ def test_extrapolating_in_two_steps_adds_no_doubt():
     in_two_steps = pose_filter.extrapolate(pose_filter.extrapolate(state, wheels, 150_000_000), wheels, 10**9)
     assert (in_two_steps.left_rad, in_two_steps.t_ns) == (in_one_step.left_rad, in_one_step.t_ns)
     np.testing.assert_allclose(np.array(in_two_steps.belief.covariance)[0, 0], in_one_step.belief.xx, rtol=1e-9)
+
+
+@pytest.mark.parametrize("speeds_rad_s", [(4.0, 4.0), (-3.0, 3.5), (0.0, 0.0)], ids=["straight", "turning", "standing"])
+def test_the_ground_carries_a_robot_whose_wheels_turn_and_it_slides_aside_as_it_goes(speeds_rad_s):
+    pose_filter, state = started()
+    state = pose_filter.fuse(state, measured(0, 0.0, 0.0, 0.7))
+    drift_m_s, left, period_s = np.array([0.1, -0.05]), 0.2, 0.01
+    pose_filter.disturbance = Disturbance(left=left, drift_x_m_s=drift_m_s[0], drift_y_m_s=drift_m_s[1])
+    expected, pose = np.zeros(2), state.belief.pose
+    for step in range(1, 101):
+        turned = [speed * period_s * step for speed in speeds_rad_s]
+        state = pose_filter.move(state, step * 10_000_000, *turned, False)
+        after = advance(PARAMETERS, pose, [(*speeds_rad_s, period_s)])
+        yaw_rad, way_m = 0.5 * (pose.yaw_rad + after.yaw_rad), 0.061 * 0.5 * sum(speeds_rad_s) * period_s
+        aside = left * way_m * np.array([-math.sin(yaw_rad), math.cos(yaw_rad)])
+        carried = drift_m_s * period_s if any(speeds_rad_s) else 0.0
+        expected += np.array([after.x_m - pose.x_m, after.y_m - pose.y_m]) + aside + carried
+        pose = after
+    np.testing.assert_allclose([state.belief.x_m, state.belief.y_m], expected, atol=1e-3)
+    assert state.belief.yaw_rad == pytest.approx(pose.yaw_rad)

@@ -102,25 +102,3 @@ def test_wrap():
     assert wrap(-math.pi) == math.pi
     assert wrap(3 * math.pi + 0.1) == pytest.approx(-math.pi + 0.1)
     assert wrap(-7.0) == pytest.approx(-7.0 + math.tau)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "name"),
-    [
-        ((0.0, 0.4, 0.0), "wheel_radius_m"),
-        ((0.06, -0.4, 0.0), "axial_distance_m"),
-        ((0.06, math.inf, 0.0), "axial_distance_m"),
-        ((0.06, 0.4, math.nan), "x_icr_m"),
-        ((0.06, 0.4, 0.0, ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))), "3x3"),
-        ((0.06, 0.4, 0.0, ((1.0, 0.5, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))), "symmetric"),
-        ((0.06, 0.4, 0.0, ((1.0, 2.0, 0.0), (2.0, 1.0, 0.0), (0.0, 0.0, 1.0))), "eigenvalues"),
-    ],
-)
-def test_impossible_parameters_are_refused(arguments, name):
-    with pytest.raises(ValueError, match=name):
-        OdometryParameters(*arguments)
-
-
-def test_exactly_known_parameters_may_have_a_singular_covariance():
-    zero = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    assert OdometryParameters(0.06, 0.4, 0.0, zero).covariance == zero

@@ -13,6 +13,7 @@ from disco_hw.errors import InputError
 from disco_hw.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
 from disco_hw.model import Gaussian, load_model
 from disco_hw.tasks.circle import CircleCost
+from tests.tasks.costs import instant_cost
 
 MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
@@ -87,7 +88,7 @@ def test_a_robot_without_commands_stands_at_the_cost_of_standing():
     np.testing.assert_array_equal(run.poses, np.tile([0.75, 0.0, math.pi / 2], (30, 1)))
     assert [now_ns for now_ns, _, _ in calls] == [t_ns for _, t_ns, _ in calls] == list(range(0, 3 * 10**9, 10**8))
     assert [count for _, _, count in calls] == [min(step, 20) for step in range(30)]
-    assert CircleCost().instant_cost(0.0, *run.poses[-1, :2], run.forward_m_s[-1]) == pytest.approx(0.2)
+    assert instant_cost(CircleCost(), *run.poses[-1, :2], run.forward_m_s[-1]) == pytest.approx(0.2)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,8 @@ import torch
 from disco_hw.control import pendulum
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
-from tools.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from tests.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
+from tests.tasks.costs import instant_cost
 
 RNG = np.random.default_rng(4)
 
@@ -36,4 +37,4 @@ def test_skid_steer_and_circle():
     np.testing.assert_allclose(got, np.stack([after.x, after.y, after.yaw, forward], -1), atol=1e-12)
     circle = CircleCost(0.2, -0.1)
     cost = circle_cost(circle)(tensor(got), 0).numpy()
-    np.testing.assert_allclose(cost[2, 7], circle.instant_cost(0.0, *got[2, 7, [0, 1, 3]]))
+    np.testing.assert_allclose(cost[2, 7], instant_cost(circle, *got[2, 7, [0, 1, 3]]))

@@ -145,7 +145,6 @@ class SimulatedOperator:
         self.angles, self.last_us = [0.0, 0.0], None
         self._open_ns = self._requested_ns = None
         self._from, self._pressed_ns, self._let_go = (0.0, 0.0), None, False
-        self.strokes = 0
 
     @property
     def action(self):
@@ -175,7 +174,6 @@ class SimulatedOperator:
         if pressed and self._pressed_ns is None:
             # Open once, then pressed.
             self._pressed_ns, self._from = now_ns, tuple(self.angles)
-            self.strokes += 1
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         if (
             pressed
@@ -192,7 +190,6 @@ class SimulatedOperator:
         if not isinstance(self.action, Prompt):
             self._requested_ns = None
             return ""
-        self.strokes += 1
         if "exactly" in self.action.prompt or "one turn" in self.action.prompt:
             self._let_go, self._from = False, tuple(self.angles)
             return "y"

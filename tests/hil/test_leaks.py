@@ -76,15 +76,11 @@ class Served:
 def link(request, tmp_path):
     """Options of a transport, and a way to cut the line for a moment."""
     now_ns = time.monotonic_ns()
-    if request.param == "can":
-        end = Hub(tmp_path / "bus", now_ns)
-        pump = end.pump
-    else:
-        end = SerialLine(tmp_path / "tty", now_ns)
+    end = Hub(tmp_path / "bus", now_ns) if request.param == "can" else SerialLine(tmp_path / "tty", now_ns)
 
-        def pump(now):
-            end.collect(now)
-            end.advance(now)
+    def pump(now):
+        end.collect(now)
+        end.advance(now)
 
     served = Served(pump)
     options = {

@@ -138,10 +138,10 @@ def assert_visible(tab, stack, line=True, empty_place=(0.0, 0.0)):
         close_notices(tab)
         picture = screenshot(tab)
         return (
-            all(shows(picture, column, row, scene.TASK_COLOUR, 3) for column, row in on_line)
-            and shows(picture, *place(x_m, y_m, 0.1), scene.BODY_COLOUR, 4)
-            and not shows(picture, *place(*empty_place, 0.0), scene.TASK_COLOUR, 3)
-            and not shows(picture, *place(*empty_place, 0.0), scene.BODY_COLOUR, 3)
+            all(shows(picture, column, row, scene.LAYERS["task"].colour, 3) for column, row in on_line)
+            and shows(picture, *place(x_m, y_m, 0.1), scene.LAYERS["robot"].colour, 4)
+            and not shows(picture, *place(*empty_place, 0.0), scene.LAYERS["task"].colour, 3)
+            and not shows(picture, *place(*empty_place, 0.0), scene.LAYERS["robot"].colour, 3)
         )
 
     wait_for(tab, everything_is_there, 120.0)

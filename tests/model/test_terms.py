@@ -6,7 +6,15 @@ import pytest
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, save_model
 from disco_hw.model.step import FreeRun
-from disco_hw.model.terms import BODY_FEATURES, COMMAND_FEATURES, TERMS
+from disco_hw.model.terms import (
+    BODY_FEATURES,
+    BODY_MEMORIES,
+    BODY_TARGETS,
+    COMMAND_FEATURES,
+    COMMAND_MEMORIES,
+    TERMS,
+)
+from tests.model import features
 
 BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05
@@ -58,9 +66,36 @@ def test_no_term_goes_on_beyond_its_reach():
 @pytest.mark.long
 @pytest.mark.parametrize("target", ["command", "v_x", "v_y", "omega"])
 def test_every_feature_agrees_with_the_reference(target):
-    features = COMMAND_FEATURES if target == "command" else BODY_FEATURES
-    effects = (EffectSetting("motor_lag", {"tau_s": 0.1}), *every_term(target, features))
+    named = COMMAND_FEATURES if target == "command" else BODY_FEATURES
+    effects = (EffectSetting("motor_lag", {"tau_s": 0.1}), *every_term(target, named))
     np.testing.assert_allclose(compiled(effects), by_reference(effects), atol=1e-9)
+
+
+def test_every_feature_is_what_its_name_says():
+    u, other, v, omega, a = np.random.default_rng(3).uniform(-4.0, 4.0, (5, 50))
+    for name, found in COMMAND_FEATURES.items():
+        expected = features.feature(name, u=u, u_other=other, t=70.0)
+        np.testing.assert_allclose(found(u, other, 70.0), expected, rtol=1e-12, err_msg=name)
+    for name, found in BODY_FEATURES.items():
+        expected = features.feature(name, v=v, omega=omega, a=a, t=70.0)
+        np.testing.assert_allclose(found(v, omega, a, 70.0), expected, rtol=1e-12, err_msg=name)
+
+
+def test_every_memory_follows_what_its_name_says():
+    first, second, before = np.random.default_rng(4).uniform(-4.0, 4.0, (3, 50))
+    kinds = ((("u", "u_other"), COMMAND_MEMORIES), *((("v", "omega"), BODY_MEMORIES[each]) for each in BODY_TARGETS))
+    for names, memories in kinds:
+        motion = dict(zip(names, (first, second), strict=True))
+        for name, memory in memories.items():
+            value = memory.of(first, second)
+            np.testing.assert_array_equal(value, features.goes_in(name, **motion), err_msg=name)
+            expected = features.feature(name, mean=before, **motion)
+            np.testing.assert_allclose(memory.feature(first, second, before), expected, rtol=1e-12, err_msg=name)
+            mean, end = (follow(name, before, value, STEP_S) for follow in (features.over, features.after))
+            np.testing.assert_allclose(plain._over(memory, before, value, STEP_S), mean, atol=1e-12, err_msg=name)
+            np.testing.assert_allclose(plain._after(memory, before, value, STEP_S), end, atol=1e-12, err_msg=name)
+            one_by_one = [memory.after(b, v, STEP_S, 1.0) for b, v in zip(before, value, strict=True)]
+            np.testing.assert_allclose(one_by_one, end, atol=1e-12, err_msg=name)
 
 
 def three_terms(drag=0.0, droop=0.0, spin=0.0):

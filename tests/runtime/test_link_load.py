@@ -6,12 +6,11 @@ from hypothesis import strategies as st
 
 from disco_hw.runtime.preflight import can_load, serial_load, worst_case_bits
 from drivers.motor.reference_protocol import cyclic_frames
-from drivers.types import CyclicFrame
-from firmware_protocol.codec import packaged_dbc
+from drivers.types import CyclicFrame, NoSettings
 from firmware_protocol.serial_framing import encode_frame
 from sim.can_protocol import CanFrame, frame_bits
 
-FRAMES = cyclic_frames(packaged_dbc(), 50.0)
+FRAMES = cyclic_frames(NoSettings(), 50.0, False)
 
 
 def exact_bits(can_id, data):

@@ -30,7 +30,7 @@ TOLERANCE = 1e-4
     ("name", "ticks", "values"),
     [
         pytest.param("circle", 255, 7380, marks=pytest.mark.thorough),
-        ("adapted", 240, 7050),
+        pytest.param("adapted", 240, 7050, marks=pytest.mark.thorough),
         ("drive", 225, 4900),
         ("refined", 175, 5000),
     ],

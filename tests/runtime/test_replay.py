@@ -164,6 +164,25 @@ def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
     assert report.difference.t_ns == ticks[150][0]
 
 
+def test_within_a_tolerance_a_plan_that_is_a_step_shorter_is_a_difference(tmp_path, ticks):
+    def shortened(record):
+        return structs.replace(record, left_rad_s=record.left_rad_s[:-1]) if isinstance(record, Plan) else record
+
+    changed = [(t_ns, tuple(map(shortened, records))) for t_ns, records in ticks]
+    report = replay(write_log(tmp_path / "run.mcap", changed), 1.0)
+    assert report.difference.field == "Plan.left_rad_s"
+
+
+def test_a_record_that_the_log_lacks_is_a_difference(tmp_path, ticks):
+    changed = list(ticks)
+    t_ns, records = ticks[150]
+    changed[150] = t_ns, tuple(record for record in records if not isinstance(record, Command))
+    report = replay(write_log(tmp_path / "run.mcap", changed))
+    assert (report.difference.field, report.difference.t_ns) == ("records", t_ns)
+    assert "Command" not in report.difference.recorded
+    assert "Command" in report.difference.replayed
+
+
 def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_path, ticks):
     log = write_log(tmp_path / "later.mcap", ticks[:1], planner=PLANNER_VERSION + 1)
     text = f"{log}: its plans are of planner version {PLANNER_VERSION + 1}, .* up to {PLANNER_VERSION}; replay it with"
@@ -174,6 +193,8 @@ def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_p
 def test_plans_that_were_refined_otherwise_are_refused_and_a_log_without_plans_is_replayed(tmp_path, ticks):
     with pytest.raises(InputError, match="planner version 2, which refined them otherwise; replay it with disco-hw"):
         replay(write_log(tmp_path / "refined.mcap", ticks, planner=2))
+    # Before that, plans were not refined at all: they are sampled again.
+    assert replay(write_log(tmp_path / "sampled.mcap", ticks, planner=1)).difference.field.startswith("Plan.")
     planned = next(at for at, (_, records) in enumerate(ticks) if any(isinstance(one, Plan) for one in records))
     assert replay(write_log(tmp_path / "standing.mcap", ticks[:planned], planner=2)).ok
 

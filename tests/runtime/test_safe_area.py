@@ -64,7 +64,11 @@ class Hand:
 def robot_file(tmp_path_factory) -> Path:
     directory = tmp_path_factory.mktemp("fenced")
     path = directory / "robot.toml"
-    path.write_text((ROBOTS / "wombot.toml").read_text() + FENCE)
+    text = (ROBOTS / "wombot.toml").read_text()
+    # The controller brakes twice as hard as the robot may.
+    gentle = text.replace("max_wheel_acceleration_rad_s2 = 20.0", "max_wheel_acceleration_rad_s2 = 10.0")
+    assert gentle != text
+    path.write_text(gentle + FENCE)
     shutil.copy(ROBOTS / "wombot_model.toml", directory)
     return path
 

@@ -16,6 +16,7 @@ from disco_hw.viewer.recording import Recording
 from tests.runtime.path_robot import timed_path_robot
 from tests.runtime.simulated import replayed, write_run
 from tests.runtime.test_path_drive import drive, started
+from tests.tasks.costs import instant_cost
 
 # Half a minute of compiling; tests/control/tasks/test_timed_path.py drives such a path in every `make test`.
 pytestmark = pytest.mark.long
@@ -30,7 +31,7 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     assert isinstance(setup.config.task, TimedPathTask)
     task = setup.config.task.planned("default")
     places, _ = drive(stack, lambda: not stack.core.last.output.running, 20.0)
-    off_m = [task.instant_cost(0.02 * (k + 2), x_m, y_m, 0.0) for k, (x_m, y_m) in enumerate(places)]
+    off_m = [instant_cost(task, x_m, y_m, 0.0, 0.02 * (k + 2)) for k, (x_m, y_m) in enumerate(places)]
     assert np.sqrt(np.mean(np.square(off_m))) < 0.06
     assert np.max(off_m) < 0.2
     # It rests where and when it should, and ends when the last time is over, not before.

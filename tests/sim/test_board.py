@@ -112,12 +112,12 @@ def test_the_wheels_turn_as_the_board_says_until_it_falls_silent():
         if step == 500:
             assert robot.outputs.state == "ARMED"
             assert robot.outputs.accepted_commands == 9
-            assert robot.truth.right_speed_rad_s == pytest.approx(3.0, rel=0.05)
+            assert robot.plant.truth.right_speed_rad_s == pytest.approx(3.0, rel=0.05)
     assert reported.count(WHEELS) == 500
     assert robot.silent
     assert not robot.outputs.driver_enabled
     assert robot.outputs.brake
-    assert robot.truth.right_speed_rad_s == 0.0
+    assert robot.plant.truth.right_speed_rad_s == 0.0
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])

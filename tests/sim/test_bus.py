@@ -58,7 +58,6 @@ def test_frames_follow_after_the_intermission():
     times = [d.t_ns for d in bus.advance(LONG_NS)]
     length_ns = frame_bits(FRAME) * BIT_NS
     assert times == [length_ns * (i + 1) - 3 * BIT_NS for i in range(3)]
-    assert bus.busy_ns == 3 * length_ns
 
 
 @pytest.mark.parametrize("bitrate", [125_000, 83_333, 1_000_000])
@@ -74,7 +73,6 @@ def test_the_lowest_identifier_wins_and_the_loser_follows():
     bus.send(a, CanFrame(0x200))
     bus.send(b, CanFrame(0x100))
     assert [(d.sender, d.frame.can_id) for d in bus.advance(LONG_NS)] == [(b, 0x100), (a, 0x200)]
-    assert (a.arbitrations_lost, b.arbitrations_lost) == (1, 0)
 
 
 def test_a_frame_on_the_wire_is_not_interrupted():
@@ -138,7 +136,7 @@ def test_a_destroyed_frame_is_sent_again_after_an_error_frame():
     (delivery,) = bus.advance(LONG_NS)
     error_ns = (30 + 1 + 6 + 6 + 8 + 3) * BIT_NS
     assert delivery.t_ns == error_ns + (frame_bits(FRAME) - 3) * BIT_NS
-    assert (a.tec, b.rec, a.transmit_errors, bus.error_frames) == (7, 0, 1, 1)  # +8 then -1; +1 then -1
+    assert (a.tec, b.rec, bus.error_frames) == (7, 0, 1)  # +8 then -1; +1 then -1
 
 
 def test_a_frame_destroyed_for_ever_ends_in_bus_off_and_the_bus_is_free_again():
@@ -234,7 +232,7 @@ def test_idle_bits_before_a_frame_count_towards_recovery():
     assert bus.next_event_ns() == bus.now_ns + 27 * 11 * BIT_NS
 
 
-@pytest.mark.parametrize("bitrate", [83_333, 125_000, None])
+@pytest.mark.parametrize("bitrate", [83_333, 125_000])
 def test_recovery_completes_at_any_bit_rate(bitrate):
     bus, a, _ = bus_with("ab", bitrate)
     bus.advance(12_345)
@@ -374,14 +372,6 @@ def test_a_node_detached_in_recovery_is_forgotten():
     bus.detach(a)
     bus.advance(1)
     assert bus.next_event_ns() is None
-
-
-def test_without_a_bit_rate_a_frame_takes_no_time():
-    bus, a, _ = bus_with("ab", None)
-    bus.advance(77)
-    for can_id in (3, 1, 2):
-        bus.send(a, CanFrame(can_id))
-    assert [(d.t_ns, d.frame.can_id) for d in bus.advance(77)] == [(77, 1), (77, 2), (77, 3)]
 
 
 def test_time_does_not_go_back(bus):

@@ -7,11 +7,11 @@ import pytest
 
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig
-from sim.app import OptionError, _check_faults
+from sim.app import OptionError, VirtualRobotOptions, _check_faults
 from sim.can_protocol import ErrorState
 from sim.fault_player import COMMANDS, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import KINDS, parse_schedule
-from sim.hub import HubLink
+from sim.hub import Hub
 from sim.plant import Plant
 from sim.serial_line import SerialLine
 from sim.unixcan import UnixCanBus
@@ -151,19 +151,20 @@ def test_faults_of_processes_go_to_whoever_has_them_in_hand():
 
 
 @pytest.mark.parametrize(
-    ("kind", "link", "interface", "expected_error"),
+    ("kind", "options", "expected_error"),
     [
-        ("sigkill", "can", "unixcan", "tests/hil"),
-        ("babble", "serial", "", "CAN bus"),
-        ("bus_off", "serial", "", "CAN bus"),
-        ("drop", "can", "socketcan", "unixcan"),
+        ("sigkill", {}, "tests/hil"),
+        ("babble", {"kind": "serial"}, "CAN bus"),
+        ("bus_off", {"kind": "serial"}, "CAN bus"),
+        ("drop", {"interface": "socketcan"}, "unixcan"),
+        *((kind, {"board": "/dev/tty"}, "--board") for kind in ("drop", "unplug", "sigstop", "reboot")),
     ],
 )
-def test_what_the_simulator_cannot_do_is_refused(kind, link, interface, expected_error):
+def test_what_the_simulator_cannot_do_is_refused(kind, options, expected_error):
     lasts = "for_s=1" if KINDS[kind].lasts else ""
     schedule = parse_schedule(f'[[fault]]\nkind="{kind}"\nat_s=0\n{lasts}')
     with pytest.raises(OptionError, match=expected_error):
-        _check_faults(schedule, link, interface)
+        _check_faults(schedule, VirtualRobotOptions(**options))
 
 
 @pytest.fixture
@@ -173,7 +174,7 @@ def robot():
 
 @pytest.fixture
 def link(tmp_path):
-    link = HubLink(tmp_path / "hub", 0)
+    link = Hub(tmp_path / "hub", 0)
     yield link
     link.close()
 
@@ -202,22 +203,22 @@ def test_estop_button(robot, injection):
 
 def test_kidnap(robot, injection):
     assert injection.execute("kidnap 0.5 -1 0.25", 0) == "ok"
-    truth = robot.truth
+    truth = robot.plant.truth
     assert (truth.x_m, truth.y_m, truth.yaw_rad) == pytest.approx((0.5, -1.0, 0.25))
 
 
 def test_bus_off_of_the_robot(link, injection):
     assert injection.execute("bus_off robot", 0) == "ok"
-    assert link.robot.state is ErrorState.BUS_OFF
+    assert link.robot.node.state is ErrorState.BUS_OFF
 
 
 def test_bus_off_is_the_hosts_by_default(link, injection):
-    with UnixCanBus(str(link.hub.path)) as bus:
+    with UnixCanBus(str(link.path)) as bus:
         link.collect(0)
         assert injection.execute("bus_off", 0) == "ok"
         link.advance(0)
         assert bus.recv(1).arbitration_id == 0x40
-    assert link.robot.state is ErrorState.ACTIVE
+    assert link.robot.node.state is ErrorState.ACTIVE
 
 
 def test_unplug_lasts_as_long_as_asked(tmp_path, link, injection):
@@ -288,14 +289,13 @@ def test_state_answers_with_a_row_of_the_truth(injection):
     ],
 )
 def test_a_bad_command_is_refused_with_one_line_and_changes_nothing(robot, link, injection, text, why):
-    before = robot.truth
+    before = robot.plant.truth
     response = injection.execute(text, 0)
     assert response.startswith("error: ")
     assert why in response
     assert "\n" not in response
-    assert injection.refused == 1
-    assert robot.truth == before
-    assert link.hub.path.exists()
+    assert robot.plant.truth == before
+    assert link.path.exists()
     assert babbled(injection, link, 5) == []
 
 

@@ -181,7 +181,7 @@ def test_how_a_run_is_cut_into_steps_changes_nothing(cuts):
     pieces = [pose for milliseconds in cuts for pose in cut.step(cut.now_us + 1000 * milliseconds, 3.0, 5.0)]
     assert cut.truth == uncut.truth
     assert cut.encoder_ticks == uncut.encoder_ticks
-    assert cut.battery == uncut.battery
+    assert cut.electrics.battery == uncut.electrics.battery
     assert pieces == poses
 
 
@@ -244,12 +244,12 @@ def test_disabled_and_braked_wheels_come_to_rest():
 
 def test_readings_follow_what_the_motors_do():
     plant = Plant(NOISELESS)
-    resting_v = plant.battery.voltage_v
+    resting_v = plant.electrics.battery.voltage_v
     plant.step(3_000_000, -6.0, 6.0)
-    left_a, right_a = plant.motor_currents_a
+    left_a, right_a = plant.electrics.motor_currents_a
     assert left_a < -1.0 < 1.0 < right_a
-    assert plant.battery.voltage_v < resting_v
-    assert min(plant.motor_temperatures_c) > 22.0
+    assert plant.electrics.battery.voltage_v < resting_v
+    assert min(plant.electrics.motor_temperatures_c) > 22.0
     assert plant.measured_wheel_speeds_rad_s == pytest.approx((-6.0, 6.0), abs=0.1)
 
 

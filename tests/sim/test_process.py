@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.private_socket import SocketPathError, bind_private
+from drivers.private_files import SocketPathError, bind_private
 from sim.process import TextRecord
 from tests.tables import thinned
 

@@ -81,7 +81,7 @@ def test_unplug_and_back(link, bus):
 
 def test_a_bus_that_breaks_is_opened_again(tmp_path, capsys):
     path = tmp_path / "hub"
-    hub = Hub(path, 0, pacing=False)
+    hub = Hub(path, 0)
     link = PythonCanLink("unixcan", str(path), 0)
     assert link.filenos()
     hub.close()
@@ -92,11 +92,11 @@ def test_a_bus_that_breaks_is_opened_again(tmp_path, capsys):
     assert link.send_failures == 1
     link.collect(1 + RETRY_NS)
     assert link.errors == 2
-    hub = Hub(path, 0, pacing=False)
+    hub = Hub(path, 0)
     link.collect(1 + 2 * RETRY_NS)
-    hub.pump(1)
+    hub.collect(1)
     link.send([FRAME])
-    hub.pump(2)
+    hub.collect(2)
     assert hub.stats.frames_in == 1
     link.close()
     hub.close()

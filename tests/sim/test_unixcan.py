@@ -28,10 +28,10 @@ def hubs(folder):
     """Starts hubs, which end with the block."""
     processes = []
 
-    def start(*options):
+    def start():
         path = folder / f"hub{len(processes)}"
         process = subprocess.Popen(
-            [sys.executable, HUB_PROCESS, str(path), *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            [sys.executable, HUB_PROCESS, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
         processes.append(process)
         assert process.stdout.readline() == f"ready {path}\n".encode()
@@ -202,7 +202,7 @@ def _flood(path, start):
 
 @pytest.mark.thorough
 def test_twenty_thousand_frames_between_processes_arrive_all_and_in_order(start_hub):
-    path, _ = start_hub("--no-pacing")
+    path, _ = start_hub()
     context = multiprocessing.get_context("spawn")
     start = context.Event()
     sender = context.Process(target=_flood, args=(path, start))

@@ -34,7 +34,7 @@ def test_row_has_the_columns_and_the_true_values(robot):
     (row,) = read(",".join(TRUTH_COLUMNS) + "\n" + truth_row(robot, 42))
     assert None not in row
     assert None not in row.values()
-    truth = robot.truth
+    truth = robot.plant.truth
     assert row["t_ns"] == "42"
     assert (float(row["x_m"]), float(row["y_m"]), float(row["yaw_rad"])) == pytest.approx((1.0, -2.0, 0.5), abs=1e-5)
     assert float(row["left_speed_rad_s"]) == pytest.approx(truth.left_speed_rad_s, abs=1e-4)
@@ -101,7 +101,7 @@ class Setup:
         self.run(milliseconds)
 
     def wheel_speed(self):
-        truth = self.robot.truth
+        truth = self.robot.plant.truth
         return max(abs(truth.left_speed_rad_s), abs(truth.right_speed_rad_s))
 
 
@@ -122,7 +122,7 @@ def test_handshake_arm_drive_stop(setup):
     assert setup.wheel_speed() < 0.01
     setup.host.speeds = (2.0, 3.0)
     setup.run(1500)
-    truth = setup.robot.truth
+    truth = setup.robot.plant.truth
     assert truth.left_speed_rad_s == pytest.approx(2.0, abs=0.02)
     assert truth.right_speed_rad_s == pytest.approx(3.0, abs=0.02)
     assert setup.host.latest["WHEEL_SPEED"]["left_speed"] == pytest.approx(2.0, abs=0.1)
@@ -179,7 +179,7 @@ def test_ticks_and_pose_show_what_the_plant_does(setup):
     setup.drive(3.0, 3.0, 2000)
     setup.host.speeds = (0.0, 0.0)
     setup.run(1000)
-    truth, ticks = setup.robot.truth, setup.host.latest["WHEEL_TICKS"]
+    truth, ticks = setup.robot.plant.truth, setup.host.latest["WHEEL_TICKS"]
     distance_m = ticks["left_ticks"] / 2048 * 2 * math.pi * setup.robot.plant.parameters.wheel_radius_m
     assert math.hypot(truth.x_m, truth.y_m) == pytest.approx(distance_m, rel=0.02)
     assert setup.host.latest["POSE_POSITION"]["x"] == pytest.approx(truth.x_m, abs=1e-3)
@@ -218,14 +218,14 @@ def test_the_device_clock_has_its_own_start_and_speed():
 
 def test_error_counters_of_the_link_reach_the_firmware(setup):
     setup.run(100)
-    setup.robot.step(setup.robot.now_us + 1000, (256, 3))
+    setup.robot.step(setup.robot.plant.now_us + 1000, (256, 3))
     assert setup.robot.outputs.fault == setup.host.codec.choice_value("SYSTEM_STATE", "fault", "BUS_OFF")
 
 
 def test_kidnapping_moves_the_pose_and_not_the_ticks(setup):
     setup.run(100)
     before = setup.robot.plant.encoder_ticks
-    setup.robot.kidnap(0.5, -0.25, 1.0)
+    setup.robot.plant.kidnap(0.5, -0.25, 1.0)
     setup.run(200)
     assert setup.robot.plant.encoder_ticks == before
     assert setup.host.latest["POSE_POSITION"] == pytest.approx({"valid": 1, "x": 0.5, "y": -0.25}, abs=1e-3)
@@ -233,15 +233,15 @@ def test_kidnapping_moves_the_pose_and_not_the_ticks(setup):
 
 def test_a_restart_forgets_the_session_and_stands_still(setup):
     setup.drive(4.0, 4.0, 500)
-    position = setup.robot.truth.x_m
+    position = setup.robot.plant.truth.x_m
     setup.robot.reboot()
     assert setup.robot.outputs.left_setpoint_rad_s == 0.0
     setup.run(1)
     assert setup.robot.outputs.state in {"BOOT", "STANDBY"}
-    assert setup.robot.device_us(setup.robot.now_us) == 1000
+    assert setup.robot.device_us(setup.robot.plant.now_us) == 1000
     setup.run(1000)
     assert setup.wheel_speed() < 0.01
-    assert setup.robot.truth.x_m >= position
+    assert setup.robot.plant.truth.x_m >= position
     assert setup.robot.outputs.session == 0
 
 
@@ -277,7 +277,7 @@ def test_two_runs_with_one_seed_are_equal():
     for _ in range(2):
         setup = Setup(parameters=PlantParameters(), challenge_seed=5)
         setup.drive(3.0, 2.0, 500)
-        runs.append((setup.frames, setup.robot.truth))
+        runs.append((setup.frames, setup.robot.plant.truth))
     assert runs[0] == runs[1]
 
 

@@ -29,6 +29,24 @@ def path_along(waypoints: Waypoints, speed_m_s: float = 0.2) -> PathCost:
     return PathCost(PathTable(waypoints.places_m), speed_m_s)
 
 
+def instant_cost(
+    task: CircleCost | PathCost | TimedPathCost, x_m: float, y_m: float, forward_m_s: float, time_s: float = 0.0
+) -> float:
+    """Distance to the line and error of the forward speed as one length; of a timed path to where the robot should be.
+
+    The paper's cost of an instant.
+    """
+    if isinstance(task, TimedPathCost):
+        times_s, places_m = task.waypoints.times_s, task.waypoints.places_m
+        due_x_m, due_y_m = (np.interp(time_s, times_s, column) for column in places_m.T)
+        return math.hypot(due_x_m - x_m, due_y_m - y_m)
+    if isinstance(task, CircleCost):
+        off_m = math.hypot(x_m - task.center_x_m, y_m - task.center_y_m) - task.radius_m
+    else:
+        off_m = np.hypot(*(task.path.table[:, :2] - (x_m, y_m)).T).min()
+    return math.hypot(off_m, forward_m_s - task.speed_m_s)
+
+
 def circle_cost(circle: CircleCost, step_s: float, x_icr_m: float = 0.0) -> SequenceCost:
     """Cost of paths x, y, yaw (T + 1, K) and forward speeds (T, K) round a circle; see `CircleCost`.
 

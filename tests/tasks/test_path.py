@@ -154,12 +154,6 @@ def test_a_turn_is_sharp_by_its_angle_over_a_length():
     assert sharp_turns(0.25 * np.column_stack([np.sin(around), 1.0 - np.cos(around)]), False, 7) == []
 
 
-def test_the_instant_cost_is_distance_and_speed_error():
-    task = path_along(CORNER, speed_m_s=0.2)
-    assert task.instant_cost(0.0, 0.5, 0.3, 0.2) == pytest.approx(0.3)
-    assert task.instant_cost(0.0, 0.5, 0.0, 0.0) == pytest.approx(0.2)
-
-
 def test_a_path_without_length_is_refused():
     with pytest.raises(ValueError, match="it must be longer than"):
         PathTable(np.array([[0.0, 0.0], [0.001, 0.0]]))

@@ -11,16 +11,10 @@ from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
 from tests.tasks import costs
-from tools.bench.control import ROBOTS, compare_with_peer, torch_times_ms
+from tools.bench.control import ROBOTS, compare_with_peer
 from tools.bench.step_times import summary, times_ms, undisturbed
 
 MODEL = load_model(ROBOTS / "wombot_model.toml")
-
-
-def test_the_torch_path_is_timed_on_the_processor():
-    durations_ms = torch_times_ms(MODEL, "cpu", 32, 4)
-    assert durations_ms.shape == (4,)
-    assert (durations_ms > 0.0).all()
 
 
 def test_the_ratio_is_of_times_in_the_same_run():

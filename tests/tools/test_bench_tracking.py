@@ -9,16 +9,15 @@ import pytest
 
 from disco_hw.control.baselines import Kanayama
 from tools import bench_tracking
-from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
-from tools.mujoco_plant import BEHIND_M, MujocoPlant, mujoco_robots
+from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots, turned_robot
+from tools.mujoco_plant import BEHIND_M, mujoco_plant, mujoco_robots
 from tools.tracking import Drive, classical, drive, tracks
-from tools.turned_plant import TurnedPlant, turned_robot
 
 
 def test_a_robot_in_mujoco_turns_about_the_point_that_it_is_said_to():
     pytest.importorskip("mujoco")
     (robot,) = mujoco_robots(1000, 1, 0.0)
-    plant = MujocoPlant(robot, (1.0, 2.0, 0.5), 1)
+    plant = mujoco_plant(robot, (1.0, 2.0, 0.5), 1)
     assert plant.pose == (1.0, 2.0, 0.5)
     poses, angles, forward = [], [], []
     for _ in range(250):
@@ -46,7 +45,7 @@ def test_what_is_believed_of_the_robots_in_mujoco_is_off():
 def test_a_follower_drives_the_robot_in_mujoco_round_its_circle():
     pytest.importorskip("mujoco")
     (robot,) = mujoco_robots(1000, 1, 0.0)
-    found = drive(classical(Kanayama()), robot, tracks()["circle"], duration_s=9.0, plant_of=MujocoPlant)
+    found = drive(classical(Kanayama()), robot, tracks()["circle"], duration_s=9.0, plant_of=mujoco_plant)
     assert found.after(4.0).rms_mm < 20.0
     assert found.after(4.0).speed_m_s > 0.15
 
@@ -55,7 +54,7 @@ def test_a_robot_whose_back_is_its_front_is_the_same_machine():
     """It turns as the robot does that gets the same motion by its own front, and its sensors agree with its pose."""
     (robot,) = robots(1000, 1, grip_std=0.0, pose_std_m=0.0, yaw_std_rad=0.0, pose_delay_s=0.0)
     plant = ForeignPlant(robot, (1.0, 2.0, 0.5), 1)
-    turned = TurnedPlant(ForeignPlant, turned_robot(robot), (1.0, 2.0, 0.5 + math.pi), 1)
+    turned = ForeignPlant(turned_robot(robot), (1.0, 2.0, 0.5 + math.pi), 1)
     for _ in range(100):
         plant.advance(-3.0, -2.0, 20)
         turned.advance(2.0, 3.0, 20)
@@ -104,24 +103,6 @@ def test_a_drive_arrives_that_stays_on_the_line_and_one_in_reverse_is_seen(
     delay_s, went_back = bench_tracking._arrival_s(Straight(wheels_rad_s), robot, track, 1)
     assert (delay_s < bench_tracking.SPARE_S) == arrives
     assert went_back == backwards
-
-
-def test_the_peers_distance_from_a_line_is_that_from_its_nearest_point():
-    peers = pytest.importorskip("tools.control_peers", reason="pytorch_mppi comes with the extra [bench]")
-    import torch
-
-    points = tracks()["eight"].points_m
-    places = np.random.default_rng(1).uniform(-3.0, 3.0, (500, 2))
-    begin, way = points[:-1], np.diff(points, axis=0)
-    part = np.einsum("pnc,nc->pn", places[:, None] - begin, way) / np.einsum("nc,nc->n", way, way)
-    nearest = begin + np.clip(part, 0.0, 1.0)[..., None] * way
-    expected = np.linalg.norm(places[:, None] - nearest, axis=2).min(axis=1)
-    found = peers.distance_map(points)(*torch.tensor(places.T, dtype=torch.float32)).numpy()
-    near = expected < 1.0
-    assert near.sum() > 100
-    np.testing.assert_allclose(found[near], expected[near], atol=2e-3)
-    # Further off it only has to grow on.
-    assert (found[~near] > 0.95).all()
 
 
 @pytest.mark.parametrize(("more", "first"), [((), bench_tracking.FIRST), (("--first", "5000"), 5000)])

@@ -98,7 +98,7 @@ def test_the_same_seeds_give_the_same_run():
     runs = [FaultRun(schedule, seed=5, **FAST) for _ in range(2)]
     outcomes = [run.run(8.0) for run in runs]
     assert outcomes[0] == outcomes[1]
-    assert runs[0].robot.truth == runs[1].robot.truth
+    assert runs[0].robot.plant.truth == runs[1].robot.plant.truth
 
 
 def test_the_table_counts_what_struck_an_armed_robot():

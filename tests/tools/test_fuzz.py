@@ -18,28 +18,10 @@ def _in_temporary_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def test_hostile_files_are_read_or_refused_in_one_line(tmp_path):
-    assert fuzz.attack(1.0, 1, tmp_path) == []
-
-
-@pytest.mark.parametrize(
-    ("error", "expected_text"),
-    [(IndexError("out of range"), "IndexError"), (fuzz.InputError("first\nsecond"), "more than one line")],
-)
-def test_what_gets_through_is_reported_and_the_file_kept(tmp_path, monkeypatch, error, expected_text):
-    def fail(path):
-        raise error
-
-    monkeypatch.setitem(fuzz.READERS, "faults.toml", fail)
-    wrong = fuzz.attack(0.01, 1, tmp_path, only="faults.toml")
-    assert expected_text in wrong[0]
-    assert (tmp_path / wrong[0].partition(":")[0]).exists()
-
-
 @pytest.mark.long
 def test_every_verb_reads_or_refuses_hostile_files(tmp_path):
     # In a process of its own: what other tests have loaded would count as memory that a verb took.
-    call = "print(fuzz.attack_verbs(150, 1, pathlib.Path(sys.argv[1])))"
+    call = "print(fuzz.attack(150, 1, pathlib.Path(sys.argv[1])))"
     program = f"import sys, pathlib\nfrom tools.check import fuzz\n{call}"
     command = [sys.executable, "-c", program, str(tmp_path / "verbs")]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=250, check=False)
@@ -63,26 +45,20 @@ def test_what_a_verb_lets_through_is_reported_and_the_file_kept(tmp_path, monkey
     monkeypatch.setattr(fuzz.verb_calls, "CALLS", fuzz.verb_calls.CALLS[:1])
     parent, call = os.getpid(), fuzz.verb_calls.call
     monkeypatch.setattr(fuzz.verb_calls, "call", lambda argv: call(argv) if os.getpid() == parent else fails(argv))
-    (wrong,) = fuzz.attack_verbs(1, 1, tmp_path / "verbs")
+    (wrong,) = fuzz.attack(1, 1, tmp_path / "verbs")
     assert expected_text in wrong
     assert (tmp_path / wrong.partition(":")[0]).exists()
 
 
-def test_good_files_are_good(tmp_path):
-    for name, read in fuzz.READERS.items():
-        (tmp_path / name).write_bytes(fuzz.good_files()[name])
-        read(tmp_path / name)
-
-
 def test_a_hostile_log_is_a_sound_container():
-    good = fuzz.good_files()["run.mcap"]
+    good = fuzz.verb_calls.good_files()["run.mcap"]
     logs = [fuzz.mutated_log(good, random.Random(seed)) for seed in range(5)]
     assert all(log.startswith(b"\x89MCAP0\r\n") and log.endswith(b"\x89MCAP0\r\n") for log in logs)
     assert len(set(logs)) == 5
 
 
 def test_most_mutants_differ_and_the_same_seed_makes_the_same():
-    good = fuzz.good_files()["faults.toml"]
+    good = fuzz.verb_calls.good_files()["faults.toml"]
     mutants = [fuzz.mutated(good, random.Random(seed)) for seed in range(100)]
     assert sum(mutant != good for mutant in mutants) > 90
     assert mutants == [fuzz.mutated(good, random.Random(seed)) for seed in range(100)]

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from tools.gap import mujoco as gap_mujoco
+from tools.gap import study as gap_study
 from tools.gap.mujoco import Result, body_lag_s, drawn, injected_floor, response_of, robot_of, table, truth_of
 from tools.joystick import joystick, keyboard
 from tools.mujoco_robot import EFFECTS, ROBOTS, Habits, Recording, Robot, record
+from tools.python_mutants import imported_by
 
 LATENCY = {"pose_latency": {"latency_s": 0.2}}
 
@@ -235,3 +237,16 @@ def test_the_search_names_a_delay_and_a_latency_of_a_robot_that_is_not_ours(tmp_
     # What is reported of the robot as it is, is no delay that one would notice.
     assert nothing.named.get("command_delay", {"delay_s": 0.0})["delay_s"] < 0.05
     assert nothing.named.get("pose_latency", {"latency_s": 0.0})["latency_s"] < 0.05
+
+
+def test_results_are_of_all_the_tools_that_make_them():
+    needed, new = set(), {"tools.gap.jobs", "tools.gap.mujoco"}
+    while new:
+        needed |= new
+        files = [gap_study.ROOT / (name.replace(".", "/") + ".py") for name in new]
+        imported = {name for file in files if file.exists() for name in imported_by(file)}
+        new = {name for name in imported if name.startswith("tools.")} - needed
+    files = {name.replace(".", "/") + ".py" for name in needed}
+    files = {name for name in files if (gap_study.ROOT / name).exists()}
+    # Where results are kept, and how tables look, changes none.
+    assert files - {"tools/gap/study.py", "tools/gap/tables.py"} == {one for one in gap_study.JUDGED if "tools" in one}

@@ -5,7 +5,6 @@ import json
 import math
 
 import pytest
-from dask.distributed import LocalCluster
 from rich.console import Console
 
 from disco_hw.gap.report.blind_spots import BlindSpot
@@ -115,28 +114,19 @@ def test_a_study_goes_on_where_it_was_broken_off(tmp_path, monkeypatch):
 
     monkeypatch.setattr(gap_jobs, "work", broken_off)
     with pytest.raises(KeyboardInterrupt):
-        gap_study.study(todo, tmp_path, 1, None, QUIET)
+        gap_study.study(todo, tmp_path, 1, QUIET)
     again = []
     monkeypatch.setattr(gap_jobs, "work", lambda job: again.append(job.key) or echo(job))
-    results = gap_study.study(todo, tmp_path, 1, None, QUIET)
+    results = gap_study.study(todo, tmp_path, 1, QUIET)
     assert len(results) == len(todo)
     assert set(again) == {job.key for job in todo} - set(done)
     assert (tmp_path / "gap_confusion.png").stat().st_size > 1000
-    assert gap_study.main(["--so-far", "-o", str(tmp_path)]) == 0
     assert len(json.loads((tmp_path / "gap_study.json").read_text())["results"]) == len(todo)
     # Other code: nothing of it counts any more.
     monkeypatch.setattr(gap_study, "revision", lambda: "other")
     again.clear()
-    gap_study.study(todo, tmp_path, 1, None, QUIET)
+    gap_study.study(todo, tmp_path, 1, QUIET)
     assert len(again) == len(todo)
-
-
-def test_a_cluster_does_the_same_jobs(tmp_path, monkeypatch):
-    monkeypatch.setattr(gap_jobs, "work", echo)
-    todo = list(jobs("weak", range(1, 2)))
-    with LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as cluster:
-        results = gap_study.study(todo, tmp_path, 1, cluster.scheduler_address, QUIET)
-    assert {(found.hidden[0], found.seed) for found in results} == {(next(iter(job.hidden)), job.seed) for job in todo}
 
 
 def test_figures_have_their_numbers_and_intervals():

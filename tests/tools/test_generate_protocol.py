@@ -3,9 +3,9 @@ import sys
 
 import pytest
 
-from firmware_protocol.codec import load_protocol, packaged_dbc
+from firmware_protocol.codec import packaged_dbc
 from tools.generate import protocol as generate_protocol
-from tools.generate.protocol import FIRMWARE, generated_files, main
+from tools.generate.protocol import FIRMWARE, generated_files, load_protocol, main
 
 
 def test_committed_files_are_current():

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from disco_hw.log.load import load_drive
 from tools import joystick as people
 from tools import mujoco_robot
 from tools.joystick import COMMANDS_PER_S, STEPS_PER_S, joystick, keyboard
@@ -187,15 +186,3 @@ def test_each_other_effect_does_what_it_says():
     for name in ("payload", "worn_tyre"):
         moved = record({name: EFFECTS[name][0]}, 1, spin).truth[-1] - turning.truth[-1]
         assert np.hypot(*moved[:2]) > 0.02
-
-
-def test_it_writes_a_log_of_ours(tmp_path, capsys):
-    path = tmp_path / "log.mcap"
-    assert mujoco_robot.main(["--hide", "slope=3", "--seed", "4", "--seconds", "9", "-o", str(path)]) == 0
-    written, driven = load_drive(path), record({"slope": 3.0}, 4, joystick(4, 9.0))
-    assert written.poses.x_m == pytest.approx(driven.pose[:, 0])
-    assert written.wheels.right_angle_rad == pytest.approx(driven.angle[:, 1])
-    assert written.commands.left_rad_s == pytest.approx(driven.command[:, 0])
-    with pytest.raises(SystemExit):
-        mujoco_robot.main(["--hide", "gravity", "-o", str(path)])
-    assert "no such effect" in capsys.readouterr().err

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tools.simulated_drives import DRIVES, UnknownDriveError, Vehicle, create_drive
+from tools.simulated_drives import DRIVES, create_drive
 
 pytestmark = pytest.mark.thorough
 
@@ -105,17 +105,3 @@ def test_random_steps_hold_each_pair():
     constant_share = np.count_nonzero(np.diff(drive.left_rad_s) == 0.0) / len(drive.t_s)
     assert constant_share > 0.85
     assert drive.left_rad_s.min() < -4.0 < 4.0 < drive.left_rad_s.max()
-
-
-def test_a_drive_scales_with_the_vehicle():
-    small, large = (create_drive("straight", 1, Vehicle(max_wheel_speed_rad_s=top)) for top in (4.0, 8.0))
-    assert np.abs(small.left_rad_s).max() == pytest.approx(0.5 * np.abs(large.left_rad_s).max())
-    assert create_drive("circle", 1, Vehicle(rate_hz=20.0)).period_s == 0.05
-
-
-def test_unknown_drives_and_impossible_vehicles_are_refused():
-    with pytest.raises(UnknownDriveError, match="rich, free, circle") as caught:
-        create_drive("rich_", 1)
-    assert "\n" not in str(caught.value)
-    with pytest.raises(ValueError, match="max_wheel_speed_rad_s"):
-        Vehicle(max_wheel_speed_rad_s=0.0)

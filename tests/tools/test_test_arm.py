@@ -24,11 +24,6 @@ def test_mirrors_are_those_of_the_machines_own_debian():
     ]
 
 
-def test_what_was_fetched_is_summed_up():
-    apt_output = "Fetched 9315 kB in 5s (2063 kB/s)\nGet:1 file\nFetched 77.6 MB in 1s (93.9 MB/s)\n"
-    assert arm.fetched_mb(apt_output) == pytest.approx(86.915)
-
-
 def test_what_has_no_wheel_is_not_asked_for():
     requirements = arm.requirements('[project]\ndependencies = ["numba>=0.61", "torch>=2.6", "cobs>=1.2", "click<9"]')
     assert requirements[:2] == ["numba>=0.61", "click<9"]

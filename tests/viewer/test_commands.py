@@ -28,8 +28,8 @@ def test_a_snapshot_shows_circle_and_robot(log_file, tmp_path):
     snapshot_log(log_file, tmp_path / "end.png")
     snapshot_log(log_file, tmp_path / "start.png", at_s=0.0)
     end, start = (Image.open(tmp_path / f"{name}.png") for name in ("end", "start"))
-    assert count_of(end, scene.TASK_COLOUR) > 500
-    assert count_of(end, scene.PLAN_COLOUR) > 50
+    assert count_of(end, scene.LAYERS["task"].colour) > 500
+    assert count_of(end, scene.LAYERS["plan"].colour) > 50
     assert np.abs(np.asarray(end).astype(int) - np.asarray(start)).max() > 100, "nothing moved"
 
 
@@ -44,7 +44,7 @@ def test_a_clip_moves_with_nothing_installed(log_file, tmp_path, monkeypatch, en
     clip.load()
     assert clip.info["duration"] == 100
     first = np.asarray(clip.convert("RGB")).astype(int)
-    assert count_of(clip, scene.TASK_COLOUR, 40) > 200
+    assert count_of(clip, scene.LAYERS["task"].colour, 40) > 200
     clip.seek(2)
     assert np.abs(np.asarray(clip.convert("RGB")) - first).max() > 100
 
@@ -90,7 +90,7 @@ def test_an_mp4_is_written_and_has_every_picture(log_file, tmp_path):
     )
     pictures = np.frombuffer(read.stdout, np.uint8).reshape(-1, 448, 784, 3).astype(int)
     assert len(pictures) == 2
-    assert (np.abs(pictures[0] - scene.TASK_COLOUR).max(axis=2) < 40).sum() > 200
+    assert (np.abs(pictures[0] - scene.LAYERS["task"].colour).max(axis=2) < 40).sum() > 200
     assert np.abs(pictures[1] - pictures[0]).max() > 100
 
 

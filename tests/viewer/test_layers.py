@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.viewer.recording import stage_of_robot
-from disco_hw.viewer.scene import LAYER_COLOURS, LAYERS, Scene
+from disco_hw.viewer.scene import LAYERS, Scene
 from disco_hw.viewer.server import serving
 from disco_hw.viewer.views import add_layers, legend
 from tools.viewer_run import ROBOT_FILE
@@ -39,14 +39,13 @@ def made(monkeypatch):
 
 def test_there_is_one_ticked_box_a_layer(made):
     _, boxes, _ = made
-    assert list(boxes) == [*LAYERS.values(), "Dark"]
+    assert list(boxes) == [*(layer.label for layer in LAYERS.values()), "Dark"]
     assert [label for label, box in boxes.items() if not box.value] == ["Dark"]
 
 
 def test_the_legend_has_the_colour_of_each_layer_beside_its_name():
-    assert list(LAYER_COLOURS) == list(LAYERS)
-    for name, label in LAYERS.items():
-        assert f'rgb{LAYER_COLOURS[name]}"></span>{label}</div>' in legend()
+    for layer in LAYERS.values():
+        assert f'rgb{layer.colour}"></span>{layer.label}</div>' in legend()
 
 
 def test_dark_is_what_pale_lines_are_mixed_with(made):
@@ -61,7 +60,7 @@ def test_dark_is_what_pale_lines_are_mixed_with(made):
 @pytest.mark.parametrize("layer", LAYERS)
 def test_a_box_switches_its_own_layer_and_redraws(made, layer):
     scene, boxes, changed = made
-    for function in boxes[LAYERS[layer]].calls:
+    for function in boxes[LAYERS[layer].label].calls:
         function(SimpleNamespace(target=SimpleNamespace(value=False)))
     assert [name for name, shown in scene.layers.items() if not shown] == [layer]
     assert changed == [True]

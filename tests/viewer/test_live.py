@@ -45,32 +45,32 @@ def test_the_newest_instant_is_drawn(page):
     live.draw(everything=True)
     assert tuple(live.scene._robot.position[:2]) == pytest.approx(pose_at(50)[:2])
     assert live.scene._lines["plan"].visible
-    assert live.scene._trail.points[0, 0, :2] == pytest.approx(pose_at(0)[:2])
-    assert live.scene._trail.points[-1, 1, :2] == pytest.approx(pose_at(50)[:2])
-    assert "24.5 V" in live._summary.content
-    assert "armed on request" in live._events.content
+    assert live.scene._lines["trail"].points[0, 0, :2] == pytest.approx(pose_at(0)[:2])
+    assert live.scene._lines["trail"].points[-1, 1, :2] == pytest.approx(pose_at(50)[:2])
+    assert "24.5 V" in live._column.state.content
+    assert "armed on request" in live._column.events.content
 
 
 def test_before_anything_is_known_it_says_so(page):
     live, _ = page
     live.draw(everything=True)
-    assert "| page is behind | — ms" in live._details.content
+    assert "| page is behind | — ms" in live._column.details.content
     assert not live.scene._robot.visible
 
 
 def test_a_drive_by_hand_shows_what_is_excited_and_what_is_missing(page):
     live, _ = page
     live.draw(everything=True)
-    assert not live._excited.visible
+    assert not live._column.motions.visible
     coverage = Coverage(6.4)
     for tick in range(251):
         coverage.add(tick * PERIOD_NS, 2.0, 2.0)
     live._desk = SimpleNamespace(draft=None, status={"ok": False, "drive": {"coverage": coverage.as_dict()}})
     live.draw(everything=True)
-    assert live._excited.visible
-    assert live._coverage.content.startswith("**16 of 17 still missing**")
-    assert "○ reverse fast | 0 of 2 s" in live._coverage.content
-    assert "✔ straight slow | 3 of 3 s" in live._coverage.content
+    assert live._column.motions.visible
+    assert live._column.coverage.content.startswith("**16 of 17 still missing**")
+    assert "○ reverse fast | 0 of 2 s" in live._column.coverage.content
+    assert "✔ straight slow | 3 of 3 s" in live._column.coverage.content
 
 
 def test_records_come_over_the_feed(page):

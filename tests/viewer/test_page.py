@@ -105,13 +105,13 @@ def test_circle_and_robot_are_drawn_at_their_places_and_replay_is_sought(browser
             x_m, y_m, yaw_rad = pose_at(tick)
             # Behind the middle, clear of the ellipse that is drawn above the body.
             body = picture[pixel(x_m - 0.1 * math.cos(yaw_rad), y_m - 0.1 * math.sin(yaw_rad), 0.12)]
-            assert like(body, scene.BODY_COLOUR), body
+            assert like(body, scene.LAYERS["robot"].colour), body
         assert as_golden(picture, "scene"), off_golden(picture, "scene")
         for degrees in (100, 190, 280):
             x_m, y_m = (RADIUS_M * part(math.radians(degrees)) for part in (math.cos, math.sin))
             line = hue_near(picture, *pixel(x_m, y_m))
-            assert like(line, scene.TASK_COLOUR), (degrees, line)
-        assert not like(picture[pixel(0.0, 0.0)], scene.TASK_COLOUR)
+            assert like(line, scene.LAYERS["task"].colour), (degrees, line)
+        assert not like(picture[pixel(0.0, 0.0)], scene.LAYERS["task"].colour)
         keep(tab, "replay")
         tab.get_by_role("button", name="+1", exact=True).click()
         wait_for(tab, lambda: page.t_s == pytest.approx(3.02))

@@ -28,10 +28,10 @@ def count_shades(pixels, colour, palest):
 
 def test_every_layer_is_in_the_picture(recording, tmp_path):
     pixels = pixels_of(recording, FAN_TICK * 0.02 + 0.1, tmp_path / "a.png")
-    assert count(pixels, scene.TASK_COLOUR) > 500
-    assert count(pixels, scene.PLAN_COLOUR) > 50
-    assert count_shades(pixels, scene.FAN_COLOUR, 0.2) > 60
-    assert count(pixels, scene.ELLIPSE_COLOUR) > 10
+    assert count(pixels, scene.LAYERS["task"].colour) > 500
+    assert count(pixels, scene.LAYERS["plan"].colour) > 50
+    assert count_shades(pixels, scene.LAYERS["fan"].colour, 0.2) > 60
+    assert count(pixels, scene.LAYERS["ellipse"].colour) > 10
 
 
 def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path, monkeypatch):

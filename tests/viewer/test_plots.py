@@ -23,19 +23,19 @@ def test_rows_in_which_a_value_is_missing_are_left_out():
 def test_all_curves_are_drawn_up_to_the_instant(plots, timeline):
     plots.show(timeline, timeline.last_ns, CircleTask(), None)
     assert len(plots._plots) == 7
-    for plot in plots._plots:
-        assert plot.handle.data[0][-1] >= 3.9, plot.handle.title
-        assert len({len(column) for column in plot.handle.data}) == 1
+    for handle, _ in plots._plots:
+        assert handle.data[0][-1] >= 3.9, handle.title
+        assert len({len(column) for column in handle.data}) == 1
 
 
 def test_nothing_known_leaves_the_plots_as_they_are(plots):
-    before = [plot.handle.data for plot in plots._plots]
+    before = [handle.data for handle, _ in plots._plots]
     plots.show(Timeline(), 10, CircleTask(), None)
-    assert all(np.array_equal(a, b) for a, b in zip(before, (p.handle.data for p in plots._plots), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(before, (handle.data for handle, _ in plots._plots), strict=True))
 
 
 def test_noise_below_a_centimetre_does_not_fill_a_plot_about_zero(plots):
-    ranges = {plot.handle.title: (plot.handle.scales or {}).get("y", {}).get("range") for plot in plots._plots}
+    ranges = {handle.title: (handle.scales or {}).get("y", {}).get("range") for handle, _ in plots._plots}
     about_zero = {"Distance to the circle (m)", "x (m)", "y (m)", "yaw (rad)"}
     assert {title for title, found in ranges.items() if found} == about_zero
     for title in about_zero:

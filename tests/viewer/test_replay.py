@@ -62,7 +62,7 @@ def test_a_hidden_layer_is_hidden(page):
     page.go_to(2.0)
     page.step(0.0)
     shown = [name for name, line in page.scene._lines.items() if line.visible]
-    assert set(shown) == {"points", "plan", "ellipse", "centre", "poses"}
+    assert set(shown) == {"trail", "fan", "points", "plan", "ellipse", "centre", "poses"}
     page.scene.layers |= {"plan": False, "robot": False}
     page._redraw()
     page.step(0.0)

@@ -63,7 +63,7 @@ def test_it_opens_where_the_task_starts(drive):
     with serving("test", port=0) as served:
         page = ReplayPage(served.server, recording)
         page.step(0.0)
-        assert page._state.content.startswith("### ARMED · running\n\nrunning the task\n")
+        assert page._column.state.content.startswith("### ARMED · running\n\nrunning the task\n")
         assert page._slider.value == pytest.approx(page.t_s, abs=1e-3)
     snapshot = recording.at(page.t_s)
     assert snapshot.source == Source.PLAN.value

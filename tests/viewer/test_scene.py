@@ -51,9 +51,7 @@ def shot(timeline):
 
 
 def node(scene, layer):
-    return {
-        "task": scene._task, "robot": scene._robot, "trail": scene._trail, "fan": scene._fan, **scene._lines
-    }[layer]  # fmt: skip
+    return {"task": scene._task, "robot": scene._robot, **scene._lines}[layer]
 
 
 def test_every_layer_is_drawn_and_can_be_switched_off_and_on(scene, shot):
@@ -103,9 +101,9 @@ def test_the_circle_is_the_tasks_and_follows_its_changes(scene, shot):
 
 def test_the_trail_is_coloured_by_the_distance_to_the_task_in_force(scene, shot):
     scene.show(shot)
-    on_it = np.array(scene._trail.colors)[-1, 1]
+    on_it = np.array(scene._lines["trail"].colors)[-1, 1]
     scene.show(replace(shot, task=record_of(0, CircleTask(radius_m=0.5))))
-    off_it = np.asarray(scene._trail.colors)[-1, 1]
+    off_it = np.asarray(scene._lines["trail"].colors)[-1, 1]
     assert tuple(on_it) == tuple(scene_module.distance_colours(np.zeros(1), scene_module.TRAIL_FULL_M)[0])
     assert tuple(off_it) == tuple(scene_module.distance_colours(np.full(1, 0.25), scene_module.TRAIL_FULL_M)[0])
 
@@ -121,13 +119,13 @@ def test_the_trail_lies_below_all_else_and_fades_behind_the_robot(scene, shot):
     around = np.linspace(0.0, 6.0 * math.pi, 600)
     laps = replace(shot, trail=0.75 * np.column_stack((np.cos(around), np.sin(around))))
     scene.show(laps)
-    darkest = np.asarray(scene._trail.colors)[:, 0].astype(int).min(axis=1)
+    darkest = np.asarray(scene._lines["trail"].colors)[:, 0].astype(int).min(axis=1)
     assert (np.diff(darkest) <= 0).all()
     assert darkest[0] > 220
     assert darkest[-1] < 60
     scene.background = scene_module.DARK
     scene.show(laps)
-    assert np.asarray(scene._trail.colors)[0, 0].max() < 60
+    assert np.asarray(scene._lines["trail"].colors)[0, 0].max() < 60
 
 
 def test_the_trail_has_few_points_and_is_nowhere_beside_what_was_driven(scene, shot):
@@ -135,7 +133,7 @@ def test_the_trail_has_few_points_and_is_nowhere_beside_what_was_driven(scene, s
     driven = 0.75 * np.column_stack((np.cos(laps), np.sin(laps)))
     standing = np.repeat(driven[-1:], 3000, axis=0)
     scene.show(replace(shot, trail=np.concatenate((driven, standing))))
-    points = np.asarray(scene._trail.points)[..., :2]
+    points = np.asarray(scene._lines["trail"].points)[..., :2]
     assert len(points) < 900
     assert np.array_equal(points[1:, 0], points[:-1, 1])
     assert points[0, 0] == pytest.approx(driven[0])
@@ -188,20 +186,20 @@ def test_the_grid_has_a_line_every_metre_and_is_seen_in_the_dark_as_the_turning_
 
 def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot):
     scene.show(shot)
-    points, colours = np.asarray(scene._fan.points), np.asarray(scene._fan.colors).astype(int)
+    points, colours = np.asarray(scene._lines["fan"].points), np.asarray(scene._lines["fan"].colors).astype(int)
     assert points.shape == (6, 2, 3)
     assert points[0, 1, :2] == pytest.approx((0.1, 0.0))
     strengths = [255 - colours[2 * path, 0].min() for path in range(3)]
     assert strengths[0] > strengths[1] > strengths[2] > 0
     assert points[0, 0, 2] > points[2, 0, 2] > points[4, 0, 2]
-    assert tuple(colours[0, 0]) == scene_module.FAN_COLOUR
+    assert tuple(colours[0, 0]) == scene_module.LAYERS["fan"].colour
     scene.show(replace(shot, fan=None))
-    assert not scene._fan.visible
+    assert not scene._lines["fan"].visible
 
 
 def test_a_fan_that_is_broken_is_not_drawn(scene, shot):
     scene.show(replace(shot, fan=records.Fan(0, (0.5, 0.5), (1.0, 2.0, 3.0), (1.0, 2.0, 3.0))))
-    assert not scene._fan.visible
+    assert not scene._lines["fan"].visible
 
 
 def test_an_adapted_belief_bends_the_plan_under_its_sigma_points(scene, shot, stage):
@@ -218,10 +216,10 @@ def test_an_adapted_belief_bends_the_plan_under_its_sigma_points(scene, shot, st
 
 def test_long_lines_are_left_alone_where_only_movement_is_wanted(scene, shot, timeline):
     scene.show(shot)
-    points = np.asarray(scene._trail.points)
+    points = np.asarray(scene._lines["trail"].points)
     later = snapshot_at(timeline, START_NS + 190 * PERIOD_NS, plan_at(190))
     scene.show(later, everything=False)
-    assert np.asarray(scene._trail.points).shape == points.shape
+    assert np.asarray(scene._lines["trail"].points).shape == points.shape
     assert scene._robot.position[:2] == pytest.approx(pose_at(190)[:2])
 
 
@@ -239,7 +237,7 @@ def test_a_path_is_drawn_where_it_is_and_not_at_all_where_it_is_unknown(tmp_path
         scene.show(shot)
         np.testing.assert_allclose(np.asarray(scene._task.points)[:, :, :2], [[[3, 0], [4, 0]], [[4, 0], [4, 1]]])
         far = tuple(scene_module.distance_colours(np.ones(1), scene_module.TRAIL_FULL_M)[0])
-        assert tuple(np.asarray(scene._trail.colors)[-1, 1]) == far
+        assert tuple(np.asarray(scene._lines["trail"].colors)[-1, 1]) == far
         scene.knows_task = False
         scene.show(shot)
         assert not scene._task.visible

@@ -1,8 +1,7 @@
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.log.reader import open_log
-from disco_hw.viewer.recording import stage_of_log, stage_of_robot
+from disco_hw.viewer.recording import Recording, stage_of_robot
 from tools.viewer_run import MODEL_FILE, ROBOT_FILE
 
 
@@ -13,8 +12,8 @@ def test_the_robot_file_and_its_model():
 
 
 def test_a_log_brings_both_files(log_file):
-    with open_log(log_file) as log:
-        stage = stage_of_log(log)
+    with Recording(log_file) as recording:
+        stage = recording.stage
     expected = stage_of_robot(ROBOT_FILE, MODEL_FILE)
     assert stage.task == expected.task
     assert stage.model.belief.mean().tolist() == expected.model.belief.mean().tolist()

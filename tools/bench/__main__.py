@@ -21,7 +21,6 @@ PARTS = (
     "bench_adapt",
     "bench_bridge",
     "bench_control",
-    "bench_control_path",
     "bench_estimation",
     "bench_import",
     "bench_inference",

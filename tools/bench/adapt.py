@@ -18,14 +18,15 @@ from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import NAMES, Geometry, believed_geometry, with_geometry
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon.run import warm_up
-from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES, AdaptOptions, run_adapt
+from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES
 from disco_hw.log.reader import open_log
 from disco_hw.model import load_model, model_text
 from disco_hw.runtime.assembly import apply_geometry, create_fast_adaptation, create_pipeline, create_planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.types import PoseSample, Readings, WheelSample
+from tools.bench.step_times import percentiles, times_ms
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
-from tools.stack import FAST_START, FAST_TASK, first_truth_s, newest_truth_s, running_stack
+from tools.stack import CIRCLE_START, FAST_START, FAST_TASK, first_truth_s, newest_truth_s, running_stack
 
 Array = NDArray[np.float64]
 
@@ -36,9 +37,9 @@ _TO_ADAPTATION, _FROM_ADAPTATION = [2, 0, 1], [1, 2, 0]
 
 
 def run() -> dict[str, float]:
-    """Microseconds of the daemon's calls, figures of the loop in real time, and of the experiment."""
+    """Microseconds of the daemon's calls, and figures of the loop in real time."""
     setup = load_setup(SHIPPED_ROBOT)
-    return _calls(setup) | _live() | _changed_live() | _won_back(setup)
+    return _calls(setup) | _live() | _changed_live()
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +47,14 @@ class Scenario:
     """A drive of a foreign robot: what it is, how it changes at `change_s`, and how good its poses are.
 
     `changed` gives the robot after `seconds` of driving. `narrow`: the belief at first is 1 % wide, else 15 %.
-    `poses`: every how many-th pose arrives, and the noise added to it (m, rad); `stated`: the part of that noise which
-    the poses state. `wrong`: one pose of so many is off by so many metres. At `carried_s` somebody carries the robot.
-    Evaluated over the last `evaluated_s`. `step` of the length number `index` by a factor: how soon 80 % is known.
+    `poses`: every how many-th pose arrives, and the noise added to it (m, rad), which the poses state. Evaluated over
+    the last `evaluated_s`. `step` of the length number `index` by a factor: how soon 80 % is known.
     """
 
     robot: Callable[[int], ForeignRobot] = lambda seed: ForeignRobot(*NOMINAL)
     changed: Callable[[ForeignRobot, float], ForeignRobot] = lambda robot, seconds: robot
     narrow: bool = False
     poses: tuple[int, float, float] = (1, 0.0, 0.0)
-    stated: float = 1.0
-    wrong: tuple[int, float] = (0, 0.0)
-    carried_s: float = math.inf
     duration_s: float = 45.0
     evaluated_s: float = 15.0
     step: tuple[int, float] | None = None
@@ -147,10 +144,7 @@ def estimate(scenario: Scenario, seed: int) -> Estimated:
     for tick in range(round(scenario.duration_s / 0.02)):
         seconds = 0.02 * tick
         if tick % 25 == 0:
-            other = ForeignPlant(scenario.changed(first, seconds), plant.pose, 1)
-            plant.robot, plant._numbers = other.robot, other._numbers
-        if seconds >= scenario.carried_s > seconds - 0.02:
-            plant.state[:3] = 2.0, -1.0, -2.0
+            plant.become(scenario.changed(first, seconds))
         adaptation.feed(plant.now_ns, _as_good(plant.readings(), scenario, noise))
         adaptation.step(plant.now_ns)
         plant.advance(*_commands(seconds), 20)
@@ -178,24 +172,17 @@ def _commands(seconds: float) -> tuple[float, float]:
 
 
 def _as_good(readings: Readings, scenario: Scenario, noise: np.random.Generator) -> Readings:
-    """The readings with poses made rarer, noisier and wrong."""
+    """The readings with poses made rarer and noisier."""
     every, position_m, yaw_rad = scenario.poses
-    stated, (each, wrong_m) = scenario.stated, scenario.wrong
     found = []
     for pose in readings.poses:
-        number = pose.t_ns // 40_000_000
-        if number % every == 0:
+        if pose.t_ns // 40_000_000 % every == 0:
             x, y, yaw = noise.standard_normal(3) * (position_m, position_m, yaw_rad)
-            if each and number % each == each - 1:
-                x += wrong_m
-            spread = (
-                math.hypot(pose.position_std_m, stated * position_m),
-                math.hypot(pose.yaw_std_rad, stated * yaw_rad),
-            )
             found.append(
                 msgspec.structs.replace(
                     pose, x_m=pose.x_m + x, y_m=pose.y_m + y, yaw_rad=pose.yaw_rad + yaw,
-                    position_std_m=spread[0], yaw_std_rad=spread[1],
+                    position_std_m=math.hypot(pose.position_std_m, position_m),
+                    yaw_std_rad=math.hypot(pose.yaw_std_rad, yaw_rad),
                 )
             )  # fmt: skip
     return Readings(wheels=readings.wheels, poses=tuple(found))
@@ -215,22 +202,17 @@ def _calls(setup: Setup) -> dict[str, float]:
             wheels=(WheelSample(t_ns, t_ns, angle_rad, angle_rad, 4.0, 4.0),), poses=(pose,) if k % 2 else ()
         )
 
-    figures = _timed("adapt.feed", 2000, lambda k: adaptation.feed(k * 20_000_000, readings(k)))
-    figures |= _timed("adapt.step", 2000, lambda k: adaptation.step(k * 20_000_000))
     believed = believed_geometry(setup.model)
-    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(300)]
-    figures |= _timed("adapt.apply_geometry", 300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k]))
+    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(320)]
+    calls: dict[str, tuple[int, Callable[[int], object]]] = {
+        "feed": (2000, lambda k: adaptation.feed(k * 20_000_000, readings(k))),
+        "step": (2000, lambda k: adaptation.step(k * 20_000_000)),
+        "apply_geometry": (300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k])),
+    }
+    figures: dict[str, float] = {}
+    for name, (count, call) in calls.items():
+        figures |= percentiles(f"adapt.{name}_us", 1e3 * times_ms(call, count))
     return figures
-
-
-def _timed(name: str, count: int, call: Callable[[int], object]) -> dict[str, float]:
-    durations_us = np.empty(count)
-    for k in range(count):
-        begun = time.perf_counter()
-        call(k)
-        durations_us[k] = 1e6 * (time.perf_counter() - begun)
-    p50, p99, p999 = np.percentile(durations_us, (50.0, 99.0, 99.9))
-    return {f"{name}_p50_us": float(p50), f"{name}_p99_us": float(p99), f"{name}_p999_us": float(p999)}
 
 
 def _live() -> dict[str, float]:
@@ -258,8 +240,6 @@ LIVE_CHANGE_S = 75.0
 SETTLED_S = 20.0
 COMPARED_S = 20.0
 LIVE_TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
-# On the circle of LIVE_TASK, facing along it: x, y (m) and a quarter turn.
-LIVE_START = (0.75, 0.0, 1.5707963)
 
 
 @dataclass(frozen=True, slots=True)
@@ -293,7 +273,7 @@ def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveD
     hidden = ("--hide", f"surface_change={axle * GROWTH},{LIVE_CHANGE_S},{wheels * GROWTH}")
     # What a wrong geometry costs shows in sampled plans: refined ones make up for most of it beside the line.
     control = f'mode = "sampled"\nadaptation = "{"auto" if adapt else "off"}"'
-    with running_stack(directory, "can", LIVE_TASK, LIVE_START, hidden, model=str(narrow), control=control) as stack:
+    with running_stack(directory, "can", LIVE_TASK, CIRCLE_START, hidden, model=str(narrow), control=control) as stack:
         stack.operator.wait_for("READY", 60.0)
         stack.start()
         stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)
@@ -332,16 +312,6 @@ def _changed_live() -> dict[str, float]:
     return figures
 
 
-def _won_back(setup: Setup) -> dict[str, float]:
-    """The experiment with one seed."""
-    figures: dict[str, float] = {}
-    for row in run_adapt(setup, replace(AdaptOptions(), seeds=1)).rows():
-        name = str(row.pop("changes")).replace(" ", "_")
-        figures |= {f"adapt.{name}.{key}": float(value) for key, value in row.items()}
-    return figures
-
-
 if __name__ == "__main__":
-    argv = sys.argv[1:]
-    for key, value in (scenarios(*map(int, argv[1:])) if argv[:1] == ["scenarios"] else run()).items():
+    for key, value in scenarios(*map(int, sys.argv[2:])).items():
         print(f"{key:45} {value:12.4g}")

@@ -8,7 +8,6 @@ the machine does beside makes lateness differ: its load is given with each, and 
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -22,13 +21,12 @@ import numpy as np
 from disco_hw.daemon import send_request
 from disco_hw.experiments import READY_TIMEOUT_S, Operator, disco_hw_process
 from disco_hw.log.reader import open_log
-from tools.bench.latency import WHEEL_COMMAND
-from tools.bench.step_times import process_cpu_s
+from tools.bench.latency import WHEEL_COMMAND, frames_on_wire
+from tools.bench.step_times import process_cpu_s, summary
 from tools.stack import FAST_START, FAST_TASK, write_robot_file
 
 DOMAIN = 90
 SETTLED_S = 2.0
-_NS = 1_000_000_000
 
 
 def run(seconds: float = 30.0) -> dict[str, float]:
@@ -41,12 +39,12 @@ def run(seconds: float = 30.0) -> dict[str, float]:
         assert status["running"], status["detail"]
         send_request(Path(name) / "control.sock", {"do": "quit"})
         time.sleep(2.0)
-        figures |= _summary("bridge.odometry_from_tick", _odometry_ms(Path(name), start_ns, end_ns))
-        figures |= _summary("bridge.pose_to_command", _pose_to_command_ms(Path(name), start_ns, end_ns))
-        figures |= _summary("bridge.loop_lateness_with", _lateness_ms(Path(name), start_ns, end_ns))
+        figures |= summary("bridge.odometry_from_tick_ms", _odometry_ms(Path(name), start_ns, end_ns))
+        figures |= summary("bridge.pose_to_command_ms", _pose_to_command_ms(Path(name), start_ns, end_ns))
+        figures |= summary("bridge.loop_lateness_with_ms", _lateness_ms(Path(name), start_ns, end_ns))
     with tempfile.TemporaryDirectory() as name, circling(Path(name), bridged=False) as (daemon, start_ns):
         figures |= _loop_for(seconds, daemon, "without")
-        figures |= _summary("bridge.loop_lateness_without", _lateness_ms(Path(name), start_ns, time.monotonic_ns()))
+        figures |= summary("bridge.loop_lateness_without_ms", _lateness_ms(Path(name), start_ns, time.monotonic_ns()))
     return figures
 
 
@@ -118,12 +116,8 @@ def _pose_to_command_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarr
     """From a node's saying a pose to the next wheel command on the wire after the tick that took it."""
     offset_ns = time.time_ns() - time.monotonic_ns()
     node_rows = _node_odometry(directory)
-    on_wire = []
-    for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
-        stamp, _, frame = line.split()
-        if int(frame.partition("#")[0], 16) == WHEEL_COMMAND:
-            on_wire.append(round(float(stamp[1:-1]) * _NS))
-    commands = np.array(on_wire)
+    on_wire = frames_on_wire(directory)
+    commands = np.array([round(t_s * 1e9) for t_s, can_id, _ in on_wire if can_id == WHEEL_COMMAND])
     found = []
     with open_log(directory / "run.mcap") as log:
         for entry in log.records({"/pose"}):
@@ -138,19 +132,3 @@ def _lateness_ms(directory: Path, start_ns: int, end_ns: int) -> np.ndarray:
     with open_log(directory / "run.mcap") as log:
         ticks = [entry.record for entry in log.records({"/loop"}) if start_ns <= entry.now_ns <= end_ns]
     return np.array([tick.lateness_ns * 1e-6 for tick in ticks])
-
-
-def _summary(key: str, values_ms: np.ndarray) -> dict[str, float]:
-    return {
-        f"{key}.p50_ms": float(np.percentile(values_ms, 50)),
-        f"{key}.p99_ms": float(np.percentile(values_ms, 99)),
-        f"{key}.max_ms": float(values_ms.max()),
-        f"{key}.count": float(len(values_ms)),
-    }
-
-
-if __name__ == "__main__":
-    # So that whoever breaks it off leaves no robot, daemon or node running.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
-    for name, value in run(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0).items():
-        print(f"{name:40} {value:10.3f}")

@@ -1,4 +1,4 @@
-"""Benchmark of the planner: time of a step beside pytorch_mppi, scaling, allocations, and driving the circle.
+"""Benchmark of the planner: time of a step, beside pytorch_mppi too, and how it grows with the samples.
 
 The paper's size throughout: K = 400 sequences, T = 50 steps, L = 7 sigma points; one thread.
 """
@@ -6,24 +6,18 @@ The paper's size throughout: K = 400 sequences, T = 50 steps, L = 7 sigma points
 from __future__ import annotations
 
 import math
-import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
-from numba.core.runtime import _nrt_python, rtsys
 
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
-from disco_hw.control.black_box import BlackBoxDisco
-from disco_hw.control.kernel.step import disco_step
-from disco_hw.control.parameter_points import sigma_points, unscented_points
+from disco_hw.control.parameter_points import sigma_points
 from disco_hw.control.pendulum import PendulumPlanner, PendulumPoints
 from disco_hw.control.plan import ROTATION
-from disco_hw.experiments.circle import CircleOptions, CircleResult, Command, drive, planner_command, plants
 from disco_hw.experiments.pendulum import POSTERIOR
 from disco_hw.jit import block_function, float32, tune_loops
 from disco_hw.model import Model, load_model
@@ -31,7 +25,6 @@ from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks.circle import CircleCost
 from tools.bench.step_times import summary, times_ms, undisturbed
-from tools.torch_models import circle_cost, skid_steer_transition
 
 ROBOTS = SHIPPED_ROBOT.parent
 PERIOD_NS = 20_000_000
@@ -45,24 +38,19 @@ BURSTS = 10
 BARE_ROUNDS, BARE_SIZE = 1600, 640
 # States are made beforehand and used over and over; a step back in time leaves the plan where it is.
 CALLS = 500
-GPU_SAMPLES = 65_536
 
 
-def run(steps: int = 3000, peer_steps: int = 100, seeds: int = 8, duration_s: float = 40.0) -> dict[str, float]:
+def run(steps: int = 3000, peer_steps: int = 100) -> dict[str, float]:
     """Return every figure of the planner, times in milliseconds."""
     torch.set_num_threads(1)
     model = load_model(ROBOTS / "wombot_model.toml")
-    figures = {f"control.allocations.{key}": value for key, value in allocations(model).items()}
+    figures: dict[str, float] = {}
     with undisturbed() as allowed:
         figures["control.realtime"] = float(allowed)
         figures |= on_the_robot(steps)
         figures |= compare_with_peer("skid_steer", *skid_steer_pair(model), steps, peer_steps)
         figures |= compare_with_peer("pendulum", *pendulum_pair(), steps, peer_steps)
         figures |= scaling(model, max(steps // 100, 3))
-    if torch.cuda.is_available():
-        cuda_ms = torch_times_ms(model, "cuda", GPU_SAMPLES, 50)
-        figures |= summary("control.torch_cuda_k65536_ms", cuda_ms)
-    figures |= circle_quality(model, seeds, duration_s)
     return figures
 
 
@@ -178,94 +166,4 @@ def scaling(model: Model, steps: int) -> dict[str, float]:
     return {
         **{f"control.scaling.k{size}_ms": least[size] for size in SIZES},
         **{f"control.scaling.k{size}_over_linear": shares[size] / shares[SIZES[0]] for size in SIZES[1:]},
-    }
-
-
-@njit
-def _empty(
-    work: Any, samplings: Any, step: Any, shift: Any, gain: Any, basis: Any, limits: Any, system: Any, weights: Any
-) -> bool:
-    return True
-
-
-def allocations(model: Model, steps: int = 200) -> dict[str, float]:
-    """Count the allocations of a step on the heap.
-
-    `in_the_step`: allocations of the compiled step beyond those of an empty function with the same arguments, for which
-    numba makes a record of each array that it is handed. `bytes_grown_per_step`: Python's memory after `steps` more.
-    """
-    planner = Disco(model, CircleCost(), DiscoSettings(sampler=PAPERS_SIZE), CommandLimits(LARGEST_RAD_S))
-    planner.warm_up()
-    for number in range(20):
-        planner.plan(*moving(number))
-    arguments = planner.optimiser.arguments
-    counted = {}
-    _nrt_python.memsys_enable_stats()
-    for name, function in (("step", disco_step), ("empty", _empty)):
-        function(*arguments)
-        before = rtsys.get_allocation_stats().alloc
-        for _ in range(steps):
-            function(*arguments)
-        counted[name] = rtsys.get_allocation_stats().alloc - before
-    _nrt_python.memsys_disable_stats()
-    tracemalloc.start()
-    try:
-        planner.plan(*moving(20))
-        traced_bytes = tracemalloc.get_traced_memory()[0]
-        for number in range(21, 21 + steps):
-            planner.plan(*moving(number))
-        grown = tracemalloc.get_traced_memory()[0] - traced_bytes
-    finally:
-        tracemalloc.stop()
-    return {"in_the_step": float(counted["step"] - counted["empty"]), "bytes_grown_per_step": grown / steps}
-
-
-def torch_times_ms(model: Model, device: str, samples: int, steps: int) -> np.ndarray:
-    """Milliseconds of each step of the torch planner on the paper's circle, on a device."""
-    theta, weights = unscented_points(model, 1.0)
-    sampler = replace(PAPERS_SIZE, samples=samples)
-    planner = BlackBoxDisco(
-        skid_steer_transition(DiscoSettings().step_s), circle_cost(CircleCost()), theta[:, :3], weights, 2, sampler,
-        largest=LARGEST_RAD_S, device=device,
-    )  # fmt: skip
-    state = np.array([0.75, 0.0, 1.25, 0.0])
-    # The plan comes back as a numpy array, so a step has waited for the device.
-    return times_ms(lambda _: planner.plan(state), steps, left_out=3)
-
-
-def circle_quality(model: Model, seeds: int, duration_s: float) -> dict[str, float]:
-    """Measure how each controller drives the circle at 10 Hz.
-
-    Plants drawn from the posterior, lag 0.1 s, 5 % wheel noise. And the planner with the posterior at 50 Hz: how far
-    its commands move in a second, beside 10 Hz.
-    """
-    options = CircleOptions(seeds=seeds, duration_s=duration_s)
-    figures: dict[str, float] = {}
-    for name, command in contenders(model, options).items():
-        rate_hz = 50.0 if name == "posterior_50hz" else options.rate_hz
-        here = replace(options, rate_hz=rate_hz)
-        runs = [drive(command(theta, seed), theta, here, seed) for seed, theta in enumerate(plants(model, seeds))]
-        row: Any = CircleResult(here, CircleCost(), name, {name: runs}).rows()[0]
-        travel = [np.abs(np.diff(run.commands_rad_s, axis=0)).mean() * rate_hz for run in runs]
-        figures[f"control.circle.{name}.steady_cost"] = row["steady_cost"]
-        figures[f"control.circle.{name}.command_change_rot_s"] = row["command_change_rot_s"]
-        figures[f"control.circle.{name}.command_travel_rot_s2"] = float(np.mean(travel)) / ROTATION
-    return figures
-
-
-def contenders(model: Model, options: CircleOptions) -> dict[str, Callable[[dict[str, float], int], Command]]:
-    """Every controller of the table, made from the plant's parameters and a seed."""
-    from tools.control_peers import circle_command, circle_mppi  # noqa: PLC0415  (a peer for the benchmark only)
-
-    ours, paper = DiscoSettings(sampler=PAPERS_SIZE), DiscoSettings.paper()
-    bare = replace(model, belief=None)
-    fast = replace(options, rate_hz=50.0)
-    largest = options.largest_rot_s * ROTATION
-    plain = CircleCost().paper()
-    return {
-        "posterior": lambda _, seed: planner_command(model, CircleCost(), ours, options, seed),
-        "truth": lambda theta, seed: planner_command(bare.with_point(theta), CircleCost(), ours, options, seed),
-        "posterior_50hz": lambda _, seed: planner_command(model, CircleCost(), ours, fast, seed),
-        "paper_mode": lambda _, seed: planner_command(model, plain, paper, options, seed),
-        "pytorch_mppi": lambda _, seed: circle_command(circle_mppi(model, plain, paper, largest), seed),
     }

@@ -91,8 +91,3 @@ def write_bag(path: Path, storage: StoragePlugin) -> None:
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store)
             writer.write(connections[topic], t_ns, store.serialize_cdr(message, kind))
-
-
-if __name__ == "__main__":
-    for key, value in run().items():
-        print(f"{key:30} {value:10.1f}")

@@ -6,58 +6,50 @@ simulator keeps it. The daemon commands at 50 Hz and samples come at 100 Hz, so 
 
 from __future__ import annotations
 
-import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.log.reader import open_log
-from tools.stack import write_robot_file
+from tools.bench.step_times import summary
+from tools.stack import CIRCLE_START, running_stack
 
 WHEEL_COMMAND, WHEEL_TICKS = 0x100, 0x111
 SETTLED_S = 2.0
 
 
 def run(seconds: float = 20.0) -> dict[str, float]:
-    """Return p50, p99 and maximum in milliseconds, over CAN and over serial."""
+    """Return the latencies in milliseconds, over CAN and over serial."""
     figures: dict[str, float] = {}
     for link in ("can", "serial"):
         with tempfile.TemporaryDirectory() as name:
-            _drive(Path(name), link, seconds)
+            kept = ("--bus-log", f"{name}/bus.log")
+            with running_stack(Path(name), link, task="", start=CIRCLE_START, sim_arguments=kept) as stack:
+                stack.start()
+                time.sleep(SETTLED_S + seconds)
             total_ms, waited_ms = _latencies_ms(Path(name))
-        for key, values in (("", total_ms), ("waiting_", waited_ms)):
-            figures[f"latency.{link}.{key}p50_ms"] = float(np.percentile(values, 50))
-            figures[f"latency.{link}.{key}p99_ms"] = float(np.percentile(values, 99))
-        figures[f"latency.{link}.max_ms"] = float(total_ms.max())
+        figures |= summary(f"latency.{link}_ms", total_ms) | summary(f"latency.{link}.waiting_ms", waited_ms)
         figures[f"latency.{link}.commands"] = float(len(total_ms))
     return figures
 
 
-def _drive(directory: Path, link: str, seconds: float) -> None:
-    robot_file = write_robot_file(directory, link)
-    simulator = ["sim", str(robot_file), "--bus-log", str(directory / "bus.log")]
-    daemon = ["run", str(robot_file), "--log", str(directory / "run.mcap")]
-    with (
-        disco_hw_process("virtual robot", simulator, directory / "sim.txt") as robot,
-        disco_hw_process("daemon", daemon, directory / "daemon.txt") as host,
-    ):
-        operator = Operator(directory / "control.sock", (robot, host))
-        operator.arm()
-        operator.request("start")
-        time.sleep(SETTLED_S + seconds)
+def frames_on_wire(directory: Path) -> Iterator[tuple[float, int, bytes]]:
+    """Yield time (s), id and data of each frame that the simulator kept of the wire."""
+    for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
+        stamp, _, frame = line.split()
+        can_id, _, data = frame.partition("#")
+        yield float(stamp[1:-1]), int(can_id, 16), bytes.fromhex(data)
 
 
 def _latencies_ms(directory: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the latency of each command, wire to wire, and of that the time until the tick began, in ms."""
     passed: dict[tuple[int, bytes], list[float]] = {}
-    for line in (directory / "bus.log").read_text(encoding="utf-8").splitlines():
-        stamp, _, frame = line.split()
-        can_id, _, data = frame.partition("#")
-        if int(can_id, 16) in (WHEEL_COMMAND, WHEEL_TICKS):
-            passed.setdefault((int(can_id, 16), bytes.fromhex(data)), []).append(float(stamp[1:-1]))
+    for t_s, can_id, data in frames_on_wire(directory):
+        if can_id in (WHEEL_COMMAND, WHEEL_TICKS):
+            passed.setdefault((can_id, data), []).append(t_s)
     total_ms, waited_ms = [], []
     newest: float | None = None
     with open_log(directory / "run.mcap") as log:
@@ -79,8 +71,3 @@ def _nearest(times_s: list[float] | None, t_s: float) -> float | None:
         return None
     best = min(times_s, key=lambda time_s: abs(time_s - t_s))
     return best if abs(best - t_s) < 0.08 else None
-
-
-if __name__ == "__main__":
-    for name, value in run(float(sys.argv[1]) if len(sys.argv) > 1 else 20.0).items():
-        print(f"{name:35} {value:10.3f}")

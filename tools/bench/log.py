@@ -6,7 +6,7 @@ import random
 import resource
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Estimate, FrameIn, FrameOut, Innovation, LoopTiming, Plan, Record
 from disco_hw.log.writer import LogFile, Start
 from drivers.types import PoseSample, WheelSample
+from tools.bench.step_times import summary
 
 HORIZON = 50
 RATE_HZ = 50
@@ -76,11 +77,9 @@ def _live(path: Path) -> dict[str, float]:
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     writer_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return {
-        "log.put_tick_us.p50": _quantile(put_us, 0.5),
-        "log.put_tick_us.p99": _quantile(put_us, 0.99),
-        "log.put_tick_us.max": max(put_us),
+        **summary("log.put_tick_us", np.array(put_us)),
         "log.records_per_tick": stats.records / stats.ticks,
-        "log.poll_us.p50": _quantile(poll_us, 0.5),
+        "log.poll_us.p50": float(np.median(poll_us)),
         "log.dropped_ticks": float(stats.dropped_ticks),
         "log.writer_cpu_share": writer_s / LIVE_S,
         "log.mb_per_minute": stats.bytes / 1e6 * 60.0 / LIVE_S,
@@ -120,7 +119,3 @@ def _milliseconds(work: Callable[[], object]) -> float:
     begin = time.perf_counter()
     work()
     return (time.perf_counter() - begin) * 1e3
-
-
-def _quantile(values: Sequence[float], share: float) -> float:
-    return float(np.quantile(values, share))

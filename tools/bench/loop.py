@@ -83,8 +83,4 @@ def _receive(finished: threading.Event) -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:
-        print(json.dumps(measure(sys.argv[1], float(sys.argv[2]))))
-    else:
-        for key, value in run().items():
-            print(f"{key:45} {value:12.1f}")
+    print(json.dumps(measure(sys.argv[1], float(sys.argv[2]))))

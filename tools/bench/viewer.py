@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import signal
@@ -11,7 +10,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +34,10 @@ from disco_hw.viewer.pages import LivePage, ReplayPage, run_live
 from disco_hw.viewer.recording import Recording, Snapshot, stage_of_robot
 from disco_hw.viewer.server import serving
 from drivers.types import WheelSample
-from tools.bench.step_times import process_cpu_s
+from tools.bench.step_times import process_cpu_s, summary
 from tools.browser import chromium, opened
 from tools.stack import running_stack
-from tools.viewer_run import PERIOD_NS, ROBOT_FILE, pose_at, tick_records, write_log
+from tools.viewer_run import PERIOD_NS, pose_at, tick_records, write_log
 
 _HAS_STAMP = "[...document.querySelectorAll('input')].some(input => /^[0-9]{6,}$/.test(input.value))"
 _WATCH_STAMP = """
@@ -54,25 +53,6 @@ const look = () => {
 };
 requestAnimationFrame(look);
 """
-_FIRST_PAINT = """async () => {
-  const painted = () => performance.getEntriesByName("first-contentful-paint")[0];
-  while (!painted()) await new Promise(later => setTimeout(later, 20));
-  return [painted().startTime, performance.timeOrigin];
-}"""
-# Frames, and those of them in which the robot has moved: the page's library keeps what it draws where its tests look.
-_COUNT_FRAMES = """seconds => new Promise(done => {
-  let frames = 0, moved = 0, before = "";
-  const end = performance.now() + 1e3 * seconds;
-  const next = () => {
-    if (performance.now() >= end) { done([frames, moved]); return; }
-    frames++;
-    const place = window.__viserMutable.nodeRefFromName["/robot"].position.toArray().join();
-    if (place !== before) { moved++; before = place; }
-    requestAnimationFrame(next);
-  };
-  requestAnimationFrame(next);
-})"""
-PAINTED_PX, PAINTED_S = (390, 1400), 10.0
 LONG_S = 600.0
 SPAN_S = 10.0
 TURNS = 5
@@ -89,81 +69,7 @@ _CAMERA = {
 def run() -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="disco-hw-bench-") as scratch:
         directory = Path(scratch)
-        return {**_feed(directory), **_replay(directory), **_live(directory), **painted(directory)}
-
-
-def painted(directory: Path) -> dict[str, float]:
-    """A browser that opens the live page at 50 Hz, drawing in software: until it shows something, and how often then.
-
-    From the call to the first contents of the desk, and of the scene; frames that the scene's window has drawn in a
-    second, over some seconds, those in which the robot has moved, and the CPU time of the whole browser for a frame.
-    """
-    socket = directory / "painted.sock"
-    feed, desk, ending = ViewerFeed(feed_path(socket)), Desk(socket, ROBOT_FILE), threading.Event()
-
-    def keep_feeding() -> None:
-        begin_s = time.monotonic()
-        for tick in itertools.count():
-            if ending.wait(max(0.0, begin_s + tick * PERIOD_NS * 1e-9 - time.monotonic())):
-                return
-            feed.put(*tick_records(tick))
-
-    figures: dict[str, float] = {}
-    with serving("bench", port=0, desk=desk) as page:
-        live = LivePage(page.server, stage_of_robot(ROBOT_FILE), socket, desk)
-        threads = [threading.Thread(target=keep_feeding), threading.Thread(target=run_live, args=(live, ending.is_set))]
-        for thread in threads:
-            thread.start()
-        try:
-            with chromium() as browser:
-                for width in PAINTED_PX:
-                    with opened(browser, page.url, width, 900) as tab:
-                        figures |= {f"viewer.{name}_{width}px": value for name, value in _painted(tab).items()}
-        except pytest.skip.Exception as reason:
-            print(f"the browser's figures are left out: {reason}", file=sys.stderr)
-        finally:
-            ending.set()
-            for thread in threads:
-                thread.join()
-            feed.close()
-            desk.close()
-    return figures
-
-
-def _painted(tab: Any) -> dict[str, float]:
-    tab.frame_locator("#scene").locator("canvas").first.wait_for()
-    scene = next(frame for frame in tab.frames if "index.html" in frame.url)
-    desk_ms, desk_begin_ms = tab.evaluate(_FIRST_PAINT)
-    scene_ms, scene_begin_ms = scene.evaluate(_FIRST_PAINT)
-    tab.wait_for_timeout(5_000)
-    begin_s, begin_cpu_s = time.monotonic(), _children_cpu_s()
-    frames, moved = scene.evaluate(_COUNT_FRAMES, PAINTED_S)
-    passed_s, cpu_s = time.monotonic() - begin_s, _children_cpu_s() - begin_cpu_s
-    return {
-        "desk_painted_ms": desk_ms,
-        "scene_painted_ms": scene_begin_ms + scene_ms - desk_begin_ms,
-        "scene_frames_per_s": frames / passed_s,
-        "scene_moves_per_s": moved / passed_s,
-        "browser_cpu_ms_per_frame": 1e3 * cpu_s / max(frames, 1),
-    }
-
-
-def _children_cpu_s() -> float:
-    """CPU time of all processes below this one that live: the browser's."""
-    parents = {}
-    for directory in Path("/proc").glob("[0-9]*"):
-        with suppress(OSError):
-            fields = (directory / "stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-            parents[int(directory.name)] = int(fields[1])
-    below, found = {os.getpid()}, set[int]()
-    while below:
-        below = {pid for pid, parent in parents.items() if parent in below}
-        found |= below
-    cpu_s = 0.0
-    for pid in found:
-        with suppress(OSError):
-            cpu_s += process_cpu_s(pid)
-    return cpu_s
+        return {**_feed(directory), **_replay(directory), **_live(directory)}
 
 
 def _feed(directory: Path) -> dict[str, float]:
@@ -179,13 +85,12 @@ def _feed(directory: Path) -> dict[str, float]:
     subscriber.close()
     feed.close()
     return {
-        "viewer.feed_unwatched_cpu_us_p99": float(np.quantile(unwatched, 0.99)),
-        "viewer.feed_watched_cpu_us_p50": float(np.quantile(watched, 0.5)),
-        "viewer.feed_watched_cpu_us_p99": float(np.quantile(watched, 0.99)),
+        **summary("viewer.feed_unwatched_cpu_us", unwatched),
+        **summary("viewer.feed_watched_cpu_us", watched),
     }
 
 
-def _put_all(feed: ViewerFeed, first: int, subscriber: FeedSubscriber | None = None) -> list[float]:
+def _put_all(feed: ViewerFeed, first: int, subscriber: FeedSubscriber | None = None) -> np.ndarray:
     durations_us = []
     for now_ns, got in map(tick_records, range(first, first + 3000)):
         begin = time.thread_time()
@@ -193,7 +98,7 @@ def _put_all(feed: ViewerFeed, first: int, subscriber: FeedSubscriber | None = N
         durations_us.append((time.thread_time() - begin) * 1e6)
         if subscriber is not None:
             subscriber.receive(0.0)
-    return durations_us
+    return np.array(durations_us)
 
 
 def _replay(directory: Path) -> dict[str, float]:
@@ -218,14 +123,10 @@ def _replay(directory: Path) -> dict[str, float]:
             seeks_s.append(time.perf_counter() - begin)
             seeks_cpu_s.append(time.thread_time() - begin_cpu)
     return {
-        "viewer.open_ten_minutes_ms_min": min(opens_s) * 1e3,
-        "viewer.open_ten_minutes_ms_p50": float(np.median(opens_s)) * 1e3,
-        "viewer.open_ten_minutes_ms_max": max(opens_s) * 1e3,
-        "viewer.seek_ms_p50": float(np.quantile(seeks_s, 0.5)) * 1e3,
-        "viewer.seek_ms_max": max(seeks_s) * 1e3,
-        "viewer.open_ten_minutes_cpu_ms_min": min(opens_cpu_s) * 1e3,
-        "viewer.seek_cpu_ms_p50": float(np.quantile(seeks_cpu_s, 0.5)) * 1e3,
-        "viewer.seek_cpu_ms_max": max(seeks_cpu_s) * 1e3,
+        **summary("viewer.open_ten_minutes_ms", 1e3 * np.array(opens_s)),
+        **summary("viewer.open_ten_minutes_cpu_ms", 1e3 * np.array(opens_cpu_s)),
+        **summary("viewer.seek_ms", 1e3 * np.array(seeks_s)),
+        **summary("viewer.seek_cpu_ms", 1e3 * np.array(seeks_cpu_s)),
         "viewer.replay_stolen_ms": stolen_ms() - stolen_before_ms,
     }
 
@@ -279,14 +180,12 @@ def _live(directory: Path) -> dict[str, float]:
         except pytest.skip.Exception as reason:
             print(f"the browser's figures are left out: {reason}", file=sys.stderr)
         else:
-            figures["viewer.bus_to_browser_ms_p50"] = float(np.quantile(frame_ages_ms, 0.5))
-            figures["viewer.bus_to_browser_ms_p99"] = float(np.quantile(frame_ages_ms, 0.99))
+            figures |= summary("viewer.bus_to_browser_ms", np.array(frame_ages_ms))
             figures["viewer.bus_to_browser_frames"] = len(frame_ages_ms)
         stack.operator.request("quit")
         stack.daemon.process.wait(10.0)
     figures["viewer.page_cpu_percent"] = float(np.median(cpu_percent))
-    figures["viewer.sample_to_page_ms_p50"] = float(np.quantile(ages_ms, 0.5))
-    figures["viewer.sample_to_page_ms_p99"] = float(np.quantile(ages_ms, 0.99))
+    figures |= summary("viewer.sample_to_page_ms", np.array(ages_ms))
     with open_log(directory / "run.mcap") as log:
         for name, parts in spans.items():
             figures |= _lateness(name, [log.columns("/loop", *span) for span in parts], stolen[name])
@@ -388,10 +287,3 @@ def _reader() -> Iterator[None]:
 def _read_all(client: ClientConnection) -> None:
     for _ in client:
         pass
-
-
-if __name__ == "__main__":
-    # `python -m tools.bench.viewer painted`: what a browser shows, alone.
-    with tempfile.TemporaryDirectory(prefix="disco-hw-bench-") as alone:
-        for key, value in (painted(Path(alone)) if sys.argv[1:] == ["painted"] else run()).items():
-            print(f"{key:<40} {value:10.3f}")

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from time import perf_counter_ns
 from typing import Any
-
-import numpy as np
 
 from drivers.motor.reference_frames import FrameTransmission
 from firmware_protocol import _firmware
 from firmware_protocol.codec import Codec
 from firmware_protocol.protection import aes_cmac
-from tools.bench.step_times import percentiles
+from tools.bench.step_times import percentiles, times_ms
 
 COMMAND = {"mode": "SPEED", "left_speed": 1.5, "right_speed": -0.75, "valid_for": 0.1, "session": 7}
 SAMPLE = {"left_valid": 1, "right_valid": 1, "driver_enabled": 1, "limited": 0, "left_speed": 1.0, "right_speed": 2.0}
@@ -47,12 +44,7 @@ def run(count: int = 20_000) -> dict[str, float]:
         "wire.cryptography_cmac_us": lambda: aes_cmac(KEY, MESSAGE),
     }
     for name, what in work.items():
-        times = np.empty(count)
-        for i in range(count):
-            start = perf_counter_ns()
-            what()
-            times[i] = (perf_counter_ns() - start) * 1e-3
-        figures |= percentiles(name, times)
+        figures |= percentiles(name, 1e3 * times_ms(lambda _, what=what: what(), count))
     figures["wire.core_cmac_over_cryptography"] = (
         figures["wire.core_cmac_us.p50"] / figures["wire.cryptography_cmac_us.p50"]
     )

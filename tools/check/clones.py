@@ -1,8 +1,7 @@
 """`make test` in fresh clones of HEAD, one after the other, each with the conditions that it ran under.
 
-`python -m tools.check.clones 10 --busy 5` is ten, the last five beside four busy processes (`--processes`). It exits
-with 1 if one failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
-`--dry` only clones, and prints what would be done.
+`python -m tools.check.clones 10 --busy 5` is ten, the last five beside four busy processes. It exits with 1 if one
+failed or took longer than `--most` seconds; those beside busy processes may take `--more` seconds longer.
 """
 
 from __future__ import annotations
@@ -24,6 +23,7 @@ from pathlib import Path
 from disco_hw.processes import stolen_ms
 
 COUNT = re.compile(r"\d+ (?:passed|failed|skipped|errors?)")
+BUSY_PROCESSES = 4
 # What would have the clone use this checkout's modules or compiled kernels.
 OF_THIS_CHECKOUT = ("PYTHONPATH", "NUMBA_CACHE_DIR", "VIRTUAL_ENV", "MAKEFLAGS")
 
@@ -81,18 +81,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("clones", type=int)
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="run the last N beside busy processes")
-    parser.add_argument("--processes", type=int, default=4, metavar="N", help="how many busy processes")
     parser.add_argument("--most", type=float, default=math.inf, metavar="S", help="seconds that one may take")
     parser.add_argument("--more", type=float, default=0.0, metavar="S", help="seconds more beside busy processes")
-    parser.add_argument("--dry", action="store_true", help="clone, but only say what make would do")
     options = parser.parse_args()
-    command = ["make", "test", *(["-n"] if options.dry else [])]
     codes: list[int] = []
     for number in range(1, options.clones + 1):
-        busy_processes = options.processes if number > options.clones - options.busy else 0
+        busy_processes = BUSY_PROCESSES if number > options.clones - options.busy else 0
         with tempfile.TemporaryDirectory(prefix="clone") as folder, busy(busy_processes):
             subprocess.run(["git", "clone", "-q", ".", folder], check=True)
-            outcome = run(command, Path(folder))
+            outcome = run(["make", "test"], Path(folder))
         is_too_slow = outcome.wall_s > options.most + bool(busy_processes) * options.more
         codes.append(outcome.code or int(is_too_slow))
         print(

@@ -194,6 +194,15 @@ def _command(image: Path, processor: str, settings: list[str], *lines: str) -> l
 
 
 @contextlib.contextmanager
+def _running(command: Sequence[str]) -> Iterator[subprocess.Popen[str]]:
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
 def running_board(
     image: Path,
     processor: str,
@@ -213,36 +222,23 @@ def running_board(
         lines = [f"unix:{path},server=on,wait=off" for path in (link, bench)]
         if terminal:
             lines[0] = "pty"
-        command = _command(image, processor, _settings(board_entropy, first_us, key), *lines)
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-        try:
+        settings = _settings(board_entropy, first_us, key)
+        with _running(_command(image, processor, settings, *lines)) as process:
             port = _ports_of(process, 1)[0] if terminal else f"unix://{link}"
             with contextlib.closing(Bench(bench)) as test_bench:
                 # When it prints something, all its threads are there.
                 test_bench.latest(_START_S)
                 _prefer(process.pid)
                 yield Board(port, test_bench, process)
-        finally:
-            process.kill()
-            process.wait()
-            if process.stdout is not None:
-                process.stdout.close()
 
 
 @contextlib.contextmanager
 def running_bare_board(image: Path, processor: str) -> Iterator[tuple[str, str]]:
     """Start QEMU with an image that has a plant's line; yields the terminals of the link and of that line."""
-    command = _command(image, processor, _settings(secrets.randbits(63), 0, b""), "pty", "pty")
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-    try:
+    with _running(_command(image, processor, _settings(secrets.randbits(63), 0, b""), "pty", "pty")) as process:
         link, plant = _ports_of(process, 2)
         _prefer(process.pid)
         yield link, plant
-    finally:
-        process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
 
 
 def run_fast(image: Path, processor: str, folder: Path, seconds: float, first_us: int = 0) -> tuple[bytes, list[Truth]]:
@@ -252,17 +248,13 @@ def run_fast(image: Path, processor: str, folder: Path, seconds: float, first_us
     """
     line, bench = folder / "line", folder / "bench"
     command = _command(image, processor, _settings(1, first_us, b""), f"file:{line}", f"file:{bench}")
-    process = subprocess.Popen([*command, "-icount", "shift=5,sleep=off"])
-    try:
+    with _running([*command, "-icount", "shift=5,sleep=off"]) as process:
         # A line for each 10 ms.
         least, size = round(100 * seconds), 0
         while process.poll() is None and not (size > 20 * least and bench.read_bytes().count(b"\n") > least):
             time.sleep(1.0)
             # A busy computer has not made it yet.
             size = bench.stat().st_size if bench.exists() else 0
-    finally:
-        process.kill()
-        process.wait()
     rows = [row for text in bench.read_bytes().split(b"\n")[:-1] if (row := _truth(text)) is not None]
     return line.read_bytes(), rows
 

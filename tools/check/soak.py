@@ -31,18 +31,14 @@ READY_TIMEOUT_S = 400.0
 HOG = """import os
 parent = os.getppid()
 os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-os.nice(int('{nice}'))
 while os.getppid() == parent: pass"""
 
 
-def soak(minutes: float, realtime: bool, hog_nice: int) -> dict[str, Any]:
+def soak(minutes: float) -> dict[str, Any]:
     """Drive for so long; returns the loop's figures, what the daemon said of real time, and the drive's state."""
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         robot_file = write_robot_file(directory)
-        if not realtime:
-            text = robot_file.read_text(encoding="utf-8")
-            robot_file.write_text(text.replace("[daemon]\n", "[daemon]\nrealtime_priority = 0\n"), encoding="utf-8")
         hogs: list[subprocess.Popen[bytes]] = []
         bare_loop = directory / "bare_loop"
         subprocess.run(["cc", "-std=c99", "-O2", "-o", str(bare_loop), str(BARE_LOOP)], check=True)
@@ -54,10 +50,10 @@ def soak(minutes: float, realtime: bool, hog_nice: int) -> dict[str, Any]:
             ):
                 operator = Operator(directory / "control.sock", (robot, daemon))
                 operator.wait_for("READY", READY_TIMEOUT_S)
-                command = [sys.executable, "-S", "-c", HOG.format(nice=hog_nice)]
+                command = [sys.executable, "-S", "-c", HOG]
                 hogs = [subprocess.Popen(command) for _ in range(os.cpu_count() or 1)]
                 stolen_before_ms = stolen_ms()
-                bare = [str(bare_loop), str(PERIOD_US), str(BARE_PRIORITY if realtime else 0)]
+                bare = [str(bare_loop), str(PERIOD_US), str(BARE_PRIORITY)]
                 with subprocess.Popen(bare, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as bare_process:
                     stops = _drive(operator, minutes * 60.0)
                     bare_us = json.loads(bare_process.communicate()[0])
@@ -74,9 +70,7 @@ def soak(minutes: float, realtime: bool, hog_nice: int) -> dict[str, Any]:
                 hog.wait()
     return {
         "minutes": minutes,
-        "realtime": realtime,
         "hogs": len(hogs),
-        "hog_nice": hog_nice,
         "load": os.getloadavg()[0],
         "stolen_s": 1e-3 * (stolen_ms() - stolen_before_ms),
         "loop": status["loop"],
@@ -121,15 +115,9 @@ def _start_again(operator: Operator, state: str) -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tools.check.soak", description=__doc__)
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--no-fifo", action="store_true", help="without SCHED_FIFO, for comparison")
-    parser.add_argument("--hog-nice", type=int, default=0, help="niceness of the busy processes")
-    parser.add_argument("-o", "--out", type=Path, help="also write the figures to this JSON file")
     given = parser.parse_args()
-    found = soak(given.minutes, not given.no_fifo, given.hog_nice)
-    text = json.dumps(found, indent=1)
-    print(text)
-    if given.out is not None:
-        given.out.write_text(text + "\n", encoding="utf-8")
+    found = soak(given.minutes)
+    print(json.dumps(found, indent=1))
     lateness_us = found["loop"]["lateness_us"]["p999"]
     good = lateness_us < TARGET_P999_US and found["loop"]["overruns"] == 0
     print(
@@ -137,7 +125,7 @@ def main() -> int:
     )
     bare_us = found["bare_loop_lateness_us"]["p999"]
     print(f"a bare loop beside it: p99.9 {bare_us:.0f} us; taken by the machine's host: {found['stolen_s']:.1f} s")
-    return 0 if good or given.no_fifo else 1
+    return 0 if good else 1
 
 
 if __name__ == "__main__":

@@ -2,8 +2,7 @@
 
 The emulator is QEMU without KVM, so that it runs everywhere; it sees this machine's files read-only, and this very
 Python runs in it. What it needs comes from Debian by apt-get and stays in build/socketcan. Needs root, and there a
-Debian or Ubuntu on x86-64, or a Debian on ARM, which nobody has tried. Exits with what pytest said, 2 with one line
-where it cannot be done.
+Debian or Ubuntu on x86-64. Exits with what pytest said, 2 with one line where it cannot be done.
 """
 
 import contextlib
@@ -16,33 +15,19 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import dataclass
 from pathlib import Path
+
+from tools.check.test_arm import CannotError, run
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "socketcan"
 INTERFACE = "vcan0"
 
 
-@dataclass(frozen=True)
-class Emulator:
-    """An emulator of a kind of machine.
-
-    Its program, Debian's package of it, its own arguments; the machine's serial line, and Debian's package of a kernel.
-    """
-
-    program: str
-    package: str
-    arguments: tuple[str, ...]
-    console: str
-    kernel: str
-
-
-EMULATORS = {
-    "x86_64": Emulator("qemu-system-x86_64", "qemu-system-x86", (), "ttyS0", "linux-image-amd64"),
-    "aarch64": Emulator("qemu-system-aarch64", "qemu-system-arm", ("-machine", "virt"), "ttyAMA0", "linux-image-arm64"),
-}
+EMULATOR, KERNEL = "qemu-system-x86_64", "linux-image-amd64"
+# Programs, and the packages that have them.
 TOOLS = {
+    EMULATOR: "qemu-system-x86",
     "busybox": "busybox-static",
     "cpio": "cpio",
     "depmod": "kmod",
@@ -52,29 +37,9 @@ FOR_ROOT_FILES = ("virtio_pci", "9p", "9pnet_virtio")
 FOR_TESTS = ("can", "can-raw", "can-dev", "vcan", "slcan")
 BOOT_AND_TEST_S = 1200
 PYTEST = (
-    "-m",
-    "pytest",
-    "-p",
-    "no:cacheprovider",
-    "--color=no",
-    "--tb=short",
-    "tests/socketcan",
-    "--timeout=200",
-    "-rs",
+    *("-m", "pytest", "-p", "no:cacheprovider", "--color=no", "--tb=short"),
+    *("tests/socketcan", "--timeout=200", "-rs"),
 )
-
-
-class CannotError(Exception):
-    """Why it cannot be done here, in one line."""
-
-
-def run(*command: str, **options: object) -> subprocess.CompletedProcess[str]:
-    """Run a command and keep its output. Raises CannotError with the last line of it where it fails."""
-    done = subprocess.run(command, capture_output=True, text=True, check=False, **options)  # type: ignore[call-overload]
-    if done.returncode:
-        output_lines = (done.stderr or done.stdout).strip().splitlines() or ["it said nothing"]
-        raise CannotError(f"{' '.join(command)}: {output_lines[-1]}")
-    return done  # type: ignore[no-any-return]
 
 
 def kernel_has_vcan() -> bool:
@@ -91,25 +56,18 @@ def kernel_has_vcan() -> bool:
     return True
 
 
-def emulator_here() -> Emulator:
-    """The emulator of such a machine as this."""
-    found = EMULATORS.get(platform.machine())
-    if found is None or shutil.which("apt-get") is None:
-        raise CannotError("this kernel has no vcan, and the emulator is prepared for Debian on x86-64 or ARM; skipped")
-    return found
-
-
-def fetch(emulator: Emulator) -> tuple[Path, str]:
+def fetch() -> tuple[Path, str]:
     """Get the tools and Debian's kernel; return where it is unpacked, and its release."""
-    tools = {emulator.program: emulator.package, **TOOLS}
-    missing = [package for tool, package in tools.items() if shutil.which(tool) is None]
+    if platform.machine() != "x86_64" or shutil.which("apt-get") is None:
+        raise CannotError("this kernel has no vcan, and the emulator is prepared for Debian on x86-64; skipped")
+    missing = [package for tool, package in TOOLS.items() if shutil.which(tool) is None]
     if missing:
         run("apt-get", "update", "-qq")
         run("apt-get", "install", "-y", "-qq", "--no-install-recommends", *missing)
-    dependencies = run("apt-cache", "depends", emulator.kernel).stdout
+    dependencies = run("apt-cache", "depends", KERNEL)
     found = re.search(r"Depends: linux-image-(\S+)", dependencies)
     if found is None:
-        raise CannotError(f"apt-cache knows no {emulator.kernel}; run apt-get update")
+        raise CannotError(f"apt-cache knows no {KERNEL}; run apt-get update")
     release = found.group(1)
     unpacked = BUILD / release
     if not (unpacked / "boot" / f"vmlinuz-{release}").exists():
@@ -126,7 +84,7 @@ def module_files(unpacked: Path, release: str, names: tuple[str, ...]) -> list[s
     """The files of modules and of what they need, in the order in which they must be loaded."""
     files: list[str] = []
     for name in names:
-        output = run("modprobe", "-d", str(unpacked), "-S", release, "--show-depends", name).stdout
+        output = run("modprobe", "-d", str(unpacked), "-S", release, "--show-depends", name)
         files += [line.split()[1] for line in output.splitlines() if line.startswith("insmod")]
     return list(dict.fromkeys(files))
 
@@ -182,21 +140,20 @@ busybox poweroff -f
     return image
 
 
-def boot_command(emulator: Emulator, unpacked: Path, release: str, image: Path) -> list[str]:
+def boot_command(unpacked: Path, release: str, image: Path) -> list[str]:
     """Return the command that boots the kernel in the emulator, with this machine's files to read."""
     return [
-        emulator.program, *emulator.arguments, "-accel", "tcg,thread=multi", "-cpu", "max", "-m", "1024", "-smp", "2",
+        EMULATOR, "-accel", "tcg,thread=multi", "-cpu", "max", "-m", "1024", "-smp", "2",
         "-nographic", "-no-reboot", "-nic", "none", "-kernel", str(unpacked / "boot" / f"vmlinuz-{release}"),
-        "-initrd", str(image), "-append", f"console={emulator.console} quiet panic=-1",
+        "-initrd", str(image), "-append", "console=ttyS0 quiet panic=-1",
         "-virtfs", "local,path=/,mount_tag=root,security_model=none,readonly=on,multidevs=remap",
     ]  # fmt: skip
 
 
 def emulate() -> int:
     """Boot, run the tests, come back with their exit status."""
-    emulator = emulator_here()
-    unpacked, release = fetch(emulator)
-    command = boot_command(emulator, unpacked, release, initial_ram_disk(unpacked, release))
+    unpacked, release = fetch()
+    command = boot_command(unpacked, release, initial_ram_disk(unpacked, release))
     # A file named kvm may exist and not work: the emulator alone runs everywhere.
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as guest:
         assert guest.stdout is not None

@@ -12,12 +12,10 @@ import hashlib
 import os
 import platform
 import re
-import resource
 import shutil
 import subprocess
 import sys
 import tarfile
-import time
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,7 +34,10 @@ UNPACKED = "python3,python3-dev,gcc,libc6-dev,base-files,coreutils,dash,sed,grep
 
 # torch has no wheel for ARM without CUDA's packages, viser is the page's; these tests need neither.
 LEFT_OUT = ("torch", "viser")
-FOR_TESTS = ("pytest", "pytest-timeout", "pytest-xdist", "hypothesis", "setuptools", "crccheck", "jsonschema")
+FOR_TESTS = (
+    *("pytest", "pytest-timeout", "pytest-xdist", "hypothesis"),
+    *("setuptools", "cantools", "crccheck", "jsonschema"),
+)
 # Handed out as source alone.
 COMPILED_THERE = "cobs"
 WHEELS_FOR = [f"--platform=manylinux_2_{minor}_aarch64" for minor in (34, 31, 28, 27, 26, 24, 17)]
@@ -84,14 +85,6 @@ def mirrors(targets: str) -> list[str]:
     return list(dict.fromkeys(f"deb {row[0]} {row[1]} {row[2]}" for row in rows if row[3] == "Debian"))
 
 
-def fetched_mb(apt_output: str) -> float:
-    """Sum of what apt says that it has fetched."""
-    scale = {"": 1e-6, "k": 1e-3, "M": 1.0, "G": 1e3}
-    return sum(
-        float(size) * scale[unit] for size, unit in re.findall(r"^Fetched ([\d.]+) ([kMG]?)B in", apt_output, re.M)
-    )
-
-
 def requirements(project: str) -> list[str]:
     """Return the packages that these tests need as wheels, by the text of a pyproject.toml."""
     dependencies = tomllib.loads(project)["project"]["dependencies"]
@@ -137,16 +130,10 @@ def unpack_debian() -> None:
     half = BUILD / "root.half"
     shutil.rmtree(half, ignore_errors=True)
     BUILD.mkdir(parents=True, exist_ok=True)
-    options = ("--verbose", "--arch=arm64", "--variant=extract", "--skip=check/qemu", f"--include={UNPACKED}")
+    options = ("--arch=arm64", "--variant=extract", "--skip=check/qemu", f"--include={UNPACKED}")
     alone = ("unshare", "--mount", "--propagation=private")
-    output = run(*alone, "mmdebstrap", *options, release, str(half), *lines, env={**os.environ, "LC_ALL": "C"})
+    run(*alone, "mmdebstrap", *options, release, str(half), *lines)
     half.rename(ROOT)
-    print(f"  {fetched_mb(output):.0f} MB downloaded, {size_mb(ROOT):.0f} MB on disk", flush=True)
-
-
-def size_mb(folder: Path) -> float:
-    """Return the size of a folder on its disk, in MB."""
-    return int(run("du", "-sxk", str(folder)).split()[0]) * 1024e-6
 
 
 def let_kernel_run_arm64() -> None:
@@ -183,7 +170,6 @@ def install_wheels() -> None:
     run(*pip, "download", "--dest", str(WHEELS), "--no-deps", "--no-binary=:all:", COMPILED_THERE, env=limits)
     local = ("--no-index", "--find-links", str(WHEELS), "--no-compile", "--target", str(packages))
     run(*pip, "install", *local, *of_root, *required, env=limits)
-    print(f"  {size_mb(WHEELS):.0f} MB downloaded, {size_mb(packages):.0f} MB on disk", flush=True)
     (source,) = WHEELS.glob(f"{COMPILED_THERE}-*.tar.gz")
     with tarfile.open(source) as archive:
         archive.extractall(ROOT / "src", filter="data")
@@ -203,16 +189,9 @@ def build_project() -> None:
     run(*inside("python3", "setup.py", "-q", "egg_info", "build_ext", "--inplace"))
 
 
-def cpu_s() -> float:
-    """Processor time of all processes that have ended."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
 def main(arguments: Sequence[str]) -> int:
     """Run the tests that are named, or all that are for this."""
     pytest = ("-m", "pytest", "-p", "no:cacheprovider", *PYTEST, *(arguments or TESTS))
-    began_s = time.monotonic()
     if platform.machine() == "aarch64":
         return subprocess.run([sys.executable, *pytest], cwd=PROJECT, check=False).returncode
     try:
@@ -224,10 +203,7 @@ def main(arguments: Sequence[str]) -> int:
     except CannotError as error:
         print(f"test-arm: {error}", file=sys.stderr)
         return 2
-    print(f"ready after {time.monotonic() - began_s:.0f} s, {cpu_s():.0f} s of processor time", flush=True)
-    status = subprocess.run(inside("python3", *pytest), check=False).returncode
-    print(f"{time.monotonic() - began_s:.0f} s, {cpu_s():.0f} s of processor time, {size_mb(BUILD):.0f} MB on disk")
-    return status
+    return subprocess.run(inside("python3", *pytest), check=False).returncode
 
 
 if __name__ == "__main__":

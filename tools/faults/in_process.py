@@ -20,7 +20,7 @@ REOPEN_NS = 100_000_000
 
 
 class SimulatedCan:
-    """The robot's end satisfies `sim.RobotLink`, and `host` is the `drivers.types.Transport` of the other.
+    """The robot's end, a `sim.FaultyLink`; `host` is the `drivers.types.Transport` of the other.
 
     Time is that of the last `advance`. A silent node acknowledges all frames, as the hub's does.
     """
@@ -32,28 +32,11 @@ class SimulatedCan:
         self.host = HostTransport(self.bus)
 
     @property
-    def address(self) -> str:
-        """Description of the bus, which has no address."""
-        return "simulated CAN bus"
-
-    @property
     def error_counters(self) -> tuple[int, int]:
         """Error counters of the robot's node; the first is 256 at bus-off."""
         return self.robot.error_counters
 
-    def filenos(self) -> list[int]:
-        """Return no descriptors: nothing comes from outside."""
-        return []
-
-    def next_event_ns(self) -> int | None:
-        """Return when the bus has something to do."""
-        return self.bus.next_event_ns()
-
-    def collect(self, now_ns: int) -> int:
-        """Return 0, because no frames come from outside."""
-        return 0
-
-    def advance(self, now_ns: int, admit: int | None = None) -> list[ReceivedFrame]:
+    def advance(self, now_ns: int) -> list[ReceivedFrame]:
         """Run the bus up to `now_ns`; return what the robot has received, and hand the host what it has."""
         deliveries = self.bus.advance(now_ns)
         self.host.take(now_ns, deliveries)
@@ -69,9 +52,9 @@ class SimulatedCan:
 
     def force_bus_off(self, who: str) -> None:
         """Put the host's or the robot's controller into bus-off."""
-        node = {"host": self.host.node, "robot": self.robot.node}.get(who)
         if who not in ("host", "robot"):
             raise LinkFaultError(f"bus_off {who}: say host or robot")
+        node = self.host.node if who == "host" else self.robot.node
         if node is not None:
             self.bus.force_bus_off(node)
 
@@ -82,13 +65,6 @@ class SimulatedCan:
     def set_bus_fault(self, fault: BusFault) -> None:
         """Let `fault` decide what becomes of each frame."""
         self.bus.fault = fault
-
-    def summary(self) -> str:
-        """Counters in one line."""
-        return f"error_frames={self.bus.error_frames} host: {self.host.stats}"
-
-    def close(self) -> None:
-        """Do nothing, because the bus holds no resources."""
 
 
 class HostTransport:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 from disco_hw.config import SHIPPED_ROBOT
@@ -193,7 +193,6 @@ class FaultRun:
         seed: int = 0,
         cycle_us: int = 1000,
         planner: Planner | None = None,
-        plant: PlantParameters | None = None,
     ) -> None:
         setup = load_setup(SHIPPED_ROBOT)
         self.config = setup.config
@@ -203,13 +202,16 @@ class FaultRun:
         self._cycle_us = cycle_us
         self._period_us = round(1e6 / self.config.control.rate_hz)
         self.can = SimulatedCan()
-        parameters = plant or PlantParameters(
-            encoder_start_left_ticks=WRAP_SOON_TICKS, encoder_start_right_ticks=WRAP_SOON_TICKS
-        )
         task = circle_task(self.config.task, "the campaign")
         start = BodyPose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
         radius_m, axial_m, x_icr_m = GEOMETRY
-        parameters = replace(parameters, wheel_radius_m=radius_m, axial_distance_m=axial_m, x_icr_m=x_icr_m)
+        parameters = PlantParameters(
+            wheel_radius_m=radius_m,
+            axial_distance_m=axial_m,
+            x_icr_m=x_icr_m,
+            encoder_start_left_ticks=WRAP_SOON_TICKS,
+            encoder_start_right_ticks=WRAP_SOON_TICKS,
+        )
         self.robot = VirtualRobot(
             Plant(parameters, None, seed, start),
             FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0, cycle_s=cycle_us * 1e-6),
@@ -255,7 +257,7 @@ class FaultRun:
             if robot.firmware is not firmware:
                 monitor.restarted()
             if now_us >= self._next_tick_us:
-                truth = robot.truth
+                truth = robot.plant.truth
                 wheels = (truth.left_speed_rad_s, truth.right_speed_rad_s)
                 self._loop.ticks += 1
                 self._tick_if_able(now_ns)

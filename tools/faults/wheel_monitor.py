@@ -9,9 +9,9 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 from drivers.types import Frame
+from firmware_protocol.firmware_core import FirmwareOutputs
 
 WHEEL_COMMAND = 0x100
 MAJOR = 1
@@ -19,51 +19,18 @@ SPEED_MODE = 1
 MAY_TURN = ("ARMED", "STOPPING", "ESTOP")
 TINY = 1e-4
 ENOUGH_VIOLATIONS = 20
+# Limits that the robot was built with.
+MAX_SPEED_RAD_S = 8.0
+MAX_ACCELERATION_RAD_S2 = 20.0
+COMMAND_TIMEOUT_S = 0.1
+DRIVE_OFF_S = 0.5
+# From 8 rad/s the plant's wheels, with a lag of 0.06 s, need this long to stand once zero is asked for.
+SETTLING_S = 0.6
+STATIONARY_RAD_S = 0.05
 
 
 Pair = tuple[float, float]
 """Left and right, rad/s."""
-
-
-class Outputs(Protocol):
-    """Outputs of the controller under watch after a cycle."""
-
-    @property
-    def state(self) -> str:
-        """Name of its state."""
-
-    @property
-    def session(self) -> int:
-        """Session of the host that armed it; 0 without one."""
-
-    @property
-    def accepted_commands(self) -> int:
-        """Number of commands accepted since the controller started."""
-
-    @property
-    def driver_enabled(self) -> bool:
-        """Whether the motor driver is on."""
-
-    @property
-    def left_setpoint_rad_s(self) -> float:
-        """Setpoint of the left wheels, rad/s."""
-
-    @property
-    def right_setpoint_rad_s(self) -> float:
-        """Setpoint of the right wheels, rad/s."""
-
-
-@dataclass(frozen=True)
-class MonitoredLimits:
-    """Limits that the robot was built with."""
-
-    max_speed_rad_s: float = 8.0
-    max_acceleration_rad_s2: float = 20.0
-    command_timeout_s: float = 0.1
-    drive_off_s: float = 0.5
-    # From 8 rad/s the plant's wheels, with a lag of 0.06 s, need this long to stand once zero is asked for.
-    settling_s: float = 0.6
-    stationary_rad_s: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -80,11 +47,10 @@ class SeenCommand:
 class WheelMonitor:
     """Collects violations as sentences; an empty list is what must come out."""
 
-    limits: MonitoredLimits = field(default_factory=MonitoredLimits)
     violations: list[str] = field(default_factory=list)
     commands_seen: int = 0
     commands_accepted: int = 0
-    _last: Outputs | None = None
+    _last: FirmwareOutputs | None = None
     _last_us: int = 0
     _targets: tuple[Pair, ...] = ((0.0, 0.0),)
     _accepted_us: int | None = None
@@ -101,7 +67,7 @@ class WheelMonitor:
         self._last_counter = None
         self._falling_bound = None
 
-    def see(self, now_us: int, frames: Sequence[Frame], outputs: Outputs, wheel_speeds: Pair) -> None:
+    def see(self, now_us: int, frames: Sequence[Frame], outputs: FirmwareOutputs, wheel_speeds: Pair) -> None:
         """Check one cycle of the controller.
 
         It gets the frames that reached the controller since the last one, its outputs after it, true speeds.
@@ -120,19 +86,17 @@ class WheelMonitor:
             self._check_accepted(now_us, accepted, good, before, outputs)
         if good:
             self._last_counter = good[-1].counter
-        setpoints = (outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s)
-        earlier = (before.left_setpoint_rad_s, before.right_setpoint_rad_s)
         if before.state in ("READY", "ARMED") and outputs.state not in ("READY", "ARMED") and before.session:
             self._ended_sessions[before.session] = now_us
         if before.session != outputs.session and outputs.session:
             self._ended_sessions.pop(outputs.session, None)
-        self._check_limits(now_us, dt_s, setpoints, earlier, before, outputs)
-        self._check_time(now_us, dt_s, setpoints, earlier, before, outputs)
-        self._check_wheels(now_us, setpoints, wheel_speeds)
+        self._check_limits(now_us, dt_s, before, outputs)
+        self._check_time(now_us, dt_s, before, outputs)
+        self._check_wheels(now_us, _setpoints(outputs), wheel_speeds)
         self._last, self._last_us = outputs, now_us
 
     def _check_accepted(
-        self, now_us: int, accepted: int, good: list[SeenCommand], before: Outputs, outputs: Outputs
+        self, now_us: int, accepted: int, good: list[SeenCommand], before: FirmwareOutputs, outputs: FirmwareOutputs
     ) -> None:
         self.commands_accepted += accepted
         fitting = [c for c in good if c.session in (before.session, outputs.session)]
@@ -155,23 +119,21 @@ class WheelMonitor:
         """Return the command's wheel speeds within the limits."""
         if command.mode != SPEED_MODE:
             return (0.0, 0.0)
-        scale = min(1.0, self.limits.max_speed_rad_s / max(*map(abs, command.speeds), 1e-9))
+        scale = min(1.0, MAX_SPEED_RAD_S / max(*map(abs, command.speeds), 1e-9))
         return (command.speeds[0] * scale, command.speeds[1] * scale)
 
-    def _check_limits(
-        self, now_us: int, dt_s: float, setpoints: Pair, earlier: Pair, before: Outputs, outputs: Outputs
-    ) -> None:
-        limits = self.limits
+    def _check_limits(self, now_us: int, dt_s: float, before: FirmwareOutputs, outputs: FirmwareOutputs) -> None:
+        setpoints, earlier = _setpoints(outputs), _setpoints(before)
         turning = any(setpoints)
         for side, name in enumerate(("left", "right")):
             value, last = setpoints[side], earlier[side]
-            if not abs(value) <= limits.max_speed_rad_s + TINY:
-                self._report(now_us, f"{name} setpoint {value} rad/s is beyond {limits.max_speed_rad_s}")
+            if not abs(value) <= MAX_SPEED_RAD_S + TINY:
+                self._report(now_us, f"{name} setpoint {value} rad/s is beyond {MAX_SPEED_RAD_S}")
             if value == last:
                 continue
             if not outputs.driver_enabled and value == 0.0:
                 continue
-            if not abs(value - last) <= limits.max_acceleration_rad_s2 * dt_s + TINY:
+            if not abs(value - last) <= MAX_ACCELERATION_RAD_S2 * dt_s + TINY:
                 self._report(now_us, f"{name} setpoint went from {last} to {value} rad/s in {dt_s} s")
             # Towards the last command that had a proof, or towards standstill; never past, never elsewhere.
             targets = [target[side] for target in self._targets]
@@ -183,12 +145,9 @@ class WheelMonitor:
         if turning and not outputs.driver_enabled:
             self._report(now_us, f"setpoints {setpoints} with the driver off")
 
-    def _check_time(
-        self, now_us: int, dt_s: float, setpoints: Pair, earlier: Pair, before: Outputs, outputs: Outputs
-    ) -> None:
-        limits = self.limits
+    def _check_time(self, now_us: int, dt_s: float, before: FirmwareOutputs, outputs: FirmwareOutputs) -> None:
         age_s = float("inf") if self._accepted_us is None else (now_us - self._accepted_us) * 1e-6
-        longest_s = limits.command_timeout_s + 2.0 * dt_s
+        longest_s = COMMAND_TIMEOUT_S + 2.0 * dt_s
         if outputs.state == "ARMED" != before.state:
             self._armed_us = now_us
             if age_s > longest_s:
@@ -196,18 +155,18 @@ class WheelMonitor:
         # The watchdog runs from the instant of arming, then from the last accepted command.
         if outputs.state == "ARMED" and min(age_s, (now_us - self._armed_us) * 1e-6) > longest_s:
             self._report(now_us, f"ARMED {age_s:.3f} s after the last accepted command")
-        if outputs.driver_enabled and age_s > limits.drive_off_s + 2.0 * dt_s:
+        if outputs.driver_enabled and age_s > DRIVE_OFF_S + 2.0 * dt_s:
             self._report(now_us, f"the driver is on {age_s:.3f} s after the last accepted command")
-        fastest = max(map(abs, setpoints))
+        fastest = max(map(abs, _setpoints(outputs)))
         if outputs.state == "ARMED" or fastest == 0.0:
             self._falling_bound = None
         else:
-            bound = max(map(abs, earlier)) if self._falling_bound is None else self._falling_bound
+            bound = max(map(abs, _setpoints(before))) if self._falling_bound is None else self._falling_bound
             # The wheels are slowed down together, so the faster one sets the pace; one cycle of grace.
             if self._falling_bound is None:
-                bound += limits.max_acceleration_rad_s2 * dt_s
-            bound = max(0.0, bound - limits.max_acceleration_rad_s2 * dt_s)
-            if fastest > bound + 0.02 + limits.max_acceleration_rad_s2 * dt_s:
+                bound += MAX_ACCELERATION_RAD_S2 * dt_s
+            bound = max(0.0, bound - MAX_ACCELERATION_RAD_S2 * dt_s)
+            if fastest > bound + 0.02 + MAX_ACCELERATION_RAD_S2 * dt_s:
                 self._report(now_us, f"setpoint {fastest} rad/s in {outputs.state} where {bound:.2f} is due")
             self._falling_bound = bound
 
@@ -218,12 +177,16 @@ class WheelMonitor:
             self._zero_since_us = now_us
         zero_s = 0.0 if self._zero_since_us is None else (now_us - self._zero_since_us) * 1e-6
         fastest = max(map(abs, wheel_speeds))
-        if zero_s > self.limits.settling_s and fastest > self.limits.stationary_rad_s:
+        if zero_s > SETTLING_S and fastest > STATIONARY_RAD_S:
             self._report(now_us, f"the wheels turn at {fastest:.3f} rad/s {zero_s:.2f} s after zero was asked for")
 
     def _report(self, now_us: int, text: str) -> None:
         if len(self.violations) < ENOUGH_VIOLATIONS:
             self.violations.append(f"{now_us * 1e-6:.3f} s: {text}")
+
+
+def _setpoints(outputs: FirmwareOutputs) -> Pair:
+    return outputs.left_setpoint_rad_s, outputs.right_setpoint_rad_s
 
 
 def _towards(value: float, last: float, targets: list[float]) -> bool:

@@ -7,6 +7,7 @@ shows from when it is there while a wheel is commanded, and the robot is stopped
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,6 @@ from sim.body_dynamics import BodyPose
 from sim.devices import find_controller
 from sim.effects import hidden_effects
 from sim.fault_schedule import KINDS, ScheduledFault
-from sim.injected_faults import RobotFaults
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.sensors import PoseMeasurement
@@ -93,8 +93,7 @@ def setup_of(driver: str, speed_m_s: float) -> Setup:
     with tempfile.TemporaryDirectory() as folder:
         robot = Path(folder) / "robot.toml"
         robot.write_text(text)
-        for name in ("wombot_model.toml",):
-            (Path(folder) / name).write_bytes((ROBOTS / name).read_bytes())
+        shutil.copy(ROBOTS / "wombot_model.toml", folder)
         return load_setup(robot)
 
 
@@ -187,7 +186,6 @@ class WheelFaultRun:
             self.stack.core.pose_source.close()
             self.stack.core.pose_source = poses
         self.board = robot.board
-        self.board.faults = RobotFaults()
 
     def drive(self, seconds: float) -> list[str]:
         """Arm, start and drive; returns events of a robot that stopped by itself, none where it drove all the time."""
@@ -206,7 +204,7 @@ class WheelFaultRun:
         stood_us: int | None = None
         for tick in self.stack.ticks(seconds):
             now_us = self.stack.now_us
-            truth = self.board.truth
+            truth = self.board.plant.truth
             true = (truth.left_speed_rad_s, truth.right_speed_rad_s)
             if shows_us is None:
                 commanded = (0.0, 0.0) if tick.command is None else (tick.command.left_rad_s, tick.command.right_rad_s)

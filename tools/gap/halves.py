@@ -147,6 +147,27 @@ def unseen_errors(
     return errors
 
 
+@dataclass(frozen=True)
+class StageModels:
+    """Last fit of a searched log, the table of its gap, the stage that is offered, and a model of each stage."""
+
+    final: FinalFit
+    table: dict[str, dict[float, PredictionErrors]]
+    offered: str
+    models: dict[str, Model]
+
+    @classmethod
+    def of(cls, analysis: GapAnalysis, nominal: Model) -> StageModels:
+        """Fit the last models of a search."""
+        final = final_fit(analysis)
+        written = written_of(analysis, final, joint_predictions(analysis, final))
+        assert written[2] is not None
+        table = written[2].table()
+        kept = written[0] if written[2].kept is None else written[2].kept[0]
+        offered = offered_stage(table, kept.adds_to_timed, DEFAULT_SETTINGS)
+        return cls(final, table, offered, {stage: model_of(stage, nominal, *written)[0] for stage in STAGES})
+
+
 def black_box(drive: GriddedDrive, model: Model, ahead_s: float = 2.0) -> BlackBox:
     """A black box trained on a drive, whose poses at the starts are smoothed along the wheels' path of a model."""
     body, _, chain = channels(drive, model)
@@ -209,22 +230,18 @@ def read(path: Path) -> tuple[DriveLog, Model]:
 def taught(part: Part, others: Sequence[Part], nominal: Model, boxed: bool = False) -> Iterator[Half]:
     """What a part taught of each of some others; `boxed`: a black box too."""
     began = time.process_time()
-    final = final_fit(part.analysis)
-    written = written_of(part.analysis, final, joint_predictions(part.analysis, final))
-    assert written[2] is not None
-    kept = written[0] if written[2].kept is None else written[2].kept[0]
-    offered = offered_stage(written[2].table(), kept.adds_to_timed, DEFAULT_SETTINGS)
+    fitted = StageModels.of(part.analysis, nominal)
     cpu_s = part.cpu_s + time.process_time() - began
-    models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
-    box = black_box(grid_drive(part.log), models["refitted"]) if boxed else None
+    box = black_box(grid_drive(part.log), fitted.models["refitted"]) if boxed else None
     names = tuple(
         name for found in (part.analysis.wheels, part.analysis.body) if found is not None
         for name in (*found.names, *(term.form for term in found.unnamed))
     )  # fmt: skip
     for other in others:
-        away = values_away(part.analysis, final, other.analysis)
+        away = values_away(part.analysis, fitted.final, other.analysis)
         name = part.name if len(others) == 1 else f"{part.name} -> {other.name}"
-        yield Half(name, offered, names, unseen_errors(grid_drive(other.log), models, box=box), away, cpu_s)
+        unseen = unseen_errors(grid_drive(other.log), fitted.models, box=box)
+        yield Half(name, fitted.offered, names, unseen, away, cpu_s)
         cpu_s = 0.0
 
 

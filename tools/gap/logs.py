@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from disco_hw.drive.script import Script
-from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, differentiate_angle
+from disco_hw.log.drive import DriveLog
 from disco_hw.runtime.pipeline import Governor, WheelLimits
 from sim.effects import EFFECTS, HiddenEffects, hidden_effects
 from sim.plant_parameters import PlantParameters
+from tools.joystick import recorded_drive
 from tools.simulated_drives import ScriptedDrive, create_drive
 from tools.simulated_log import LogOptions, dirty_log_options, dirty_parameters, simulated_log, varied_parameters
 
@@ -47,9 +48,7 @@ def simulated_drive(
     if script is not None:
         driven = then_scripted(driven, script)
     rows = simulated_log(driven, parameters, effects, seed, options)
-    times = np.array([t_s for t_s, _ in rows])
-    cells = np.array([[float(cell) if cell else math.nan for cell in row] for _, row in rows])[:, 1:]
-    return as_drive(times - times[0], cells, parameters.ticks_per_rev)
+    return as_drive(rows[:, 0] - rows[0, 0], rows[:, 1:], parameters.ticks_per_rev)
 
 
 def then_scripted(drive: ScriptedDrive, script: Script) -> ScriptedDrive:
@@ -71,22 +70,14 @@ def then_scripted(drive: ScriptedDrive, script: Script) -> ScriptedDrive:
 def as_drive(t_s: np.ndarray, cells: np.ndarray, ticks_per_rev: int) -> DriveLog:
     """Rows of a log (N,), (N, 7) as a drive; the columns are those of `tools.simulated_log` after the time."""
 
-    def group(first: int, last: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def group(first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
         there = np.isfinite(cells[:, first])
         times, index = np.unique(t_s[there], return_index=True)
-        return times, cells[there][index, first:last], np.zeros(times.size, dtype=np.int64)
+        return times, cells[there][index, first:last]
 
-    command_s, command, command_segment = group(0, 2)
-    wheel_s, ticks, wheel_segment = group(2, 4)
-    pose_s, pose, pose_segment = group(4, 7)
+    wheel_s, ticks = group(2, 4)
     angle = ticks * (2.0 * math.pi / ticks_per_rev)
-    speeds = [differentiate_angle(wheel_s, angle[:, side], wheel_segment) for side in (0, 1)]
-    return DriveLog(
-        ("simulated",),
-        Commands(command_s, command[:, 0], command[:, 1], command_segment),
-        Wheels(wheel_s, angle[:, 0], angle[:, 1], speeds[0], speeds[1], wheel_segment, True, False),
-        Poses(pose_s, pose[:, 0], pose[:, 1], pose[:, 2], pose_segment),
-    )
+    return recorded_drive("simulated", *group(0, 2), wheel_s, angle, *group(4, 7))
 
 
 def realistic(name: str, seed: int, share: float = 1.0) -> dict[str, float | tuple[float, ...]]:

@@ -26,17 +26,15 @@ from scipy.optimize import least_squares, minimize_scalar
 from scipy.signal import lfilter
 
 from disco_hw.effects.registry import REGISTRY
-from disco_hw.gap import model_of, offered_stage, search_log, written_of
+from disco_hw.gap import search_log
 from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.report import EffectFinding
 from disco_hw.gap.report.judge import Measured, classify_findings, effect_findings, unnamed_findings
 from disco_hw.gap.report.page import other_known_symptoms
-from disco_hw.gap.search import joint_predictions
-from disco_hw.gap.search.analysis import final_fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 from disco_hw.model import Model
 from disco_hw.model.terms import BODY_FEATURES, BODY_MEMORIES
-from tools.gap.halves import STAGES, unseen_errors
+from tools.gap.halves import STAGES, StageModels, unseen_errors
 from tools.gap.study import revision, write_whole
 from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S
 from tools.mujoco_robot import (
@@ -323,18 +321,12 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
     nominal = Model(robot.wheel_radius_m, robot.track_m, 0.0)
     began = time.process_time()
     analysis, _ = search_log(seen.as_drive(), nominal)
-    final = final_fit(analysis)
-    fits, unnamed = effect_findings(analysis, final), unnamed_findings(analysis)
-    named, doubtful = classify_findings(fits, Measured.of(analysis, final))
-    written = written_of(analysis, final, joint_predictions(analysis, final))
-    assert written[2] is not None
-    kept = written[0] if written[2].kept is None else written[2].kept[0]
-    table = written[2].table()
-    offered = offered_stage(table, kept.adds_to_timed, DEFAULT_SETTINGS)
+    fitted = StageModels.of(analysis, nominal)
+    fits, unnamed = effect_findings(analysis, fitted.final), unnamed_findings(analysis)
+    named, doubtful = classify_findings(fits, Measured.of(analysis, fitted.final))
     cpu_s = time.process_time() - began
-    models = {stage: model_of(stage, nominal, *written)[0] for stage in STAGES}
-    unseen = unseen_errors(grid_drive(kept_back.as_drive()), models, AHEAD_S)
-    floor = table["floor"][AHEAD_S]
+    unseen = unseen_errors(grid_drive(kept_back.as_drive()), fitted.models, AHEAD_S)
+    floor = fitted.table["floor"][AHEAD_S]
     return Result(
         hidden=hidden,
         seed=seed,
@@ -342,7 +334,7 @@ def work(hidden: str, seed: int, robot: Robot = ROBOTS["middle"]) -> Result:
         unnamed=[term.form for term in unnamed],
         doubtful=[doubt.name for doubt in doubtful],
         truth=truth_of(hidden, seen, [term.form for term in unnamed]),
-        offered=offered,
+        offered=fitted.offered,
         unseen={stage: (1e3 * errors.position_m, 1e3 * errors.yaw_rad) for stage, errors in unseen.items()},
         floor=(1e3 * floor.position_m, 1e3 * floor.yaw_rad),
         injected=injected_floor(seen),

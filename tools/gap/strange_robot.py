@@ -16,8 +16,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, differentiate_angle
-from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, joystick
+from disco_hw.log.drive import DriveLog
+from tools.joystick import STEPS_PER_COMMAND, STEPS_PER_S, joystick, recorded_drive
 
 Array = NDArray[np.float64]
 
@@ -226,13 +226,6 @@ def _measured(
     count = 2.0 * math.pi / COUNTS_PER_TURN
     seen = np.round(angles[reading] / count) * count
     reading_s, posed_s, sent_s = (reading + 1) / steps_per_s, (posed + 1) / steps_per_s, np.arange(len(commands))
-    segments = [np.zeros(each.size, dtype=np.int64) for each in (sent_s, reading_s, posed_s)]
     poses = path[posed] + rng.standard_normal((posed.size, 3)) * (POSITION_STD_M, POSITION_STD_M, YAW_STD_RAD)
-    speeds = [differentiate_angle(reading_s, seen[:, side], segments[1]) for side in (0, 1)]
-    log = DriveLog(
-        ("strange",),
-        Commands(sent_s / COMMANDS_PER_S, commands[:, 0], commands[:, 1], segments[0]),
-        Wheels(reading_s, seen[:, 0], seen[:, 1], speeds[0], speeds[1], segments[1], True, False),
-        Poses(posed_s, poses[:, 0], poses[:, 1], poses[:, 2], segments[2]),
-    )
+    log = recorded_drive("strange", sent_s / COMMANDS_PER_S, commands, reading_s, seen, posed_s, poses)
     return Recording(log, path[posed], values)

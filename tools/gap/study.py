@@ -24,18 +24,20 @@ from tools.gap import jobs as gap_jobs
 from tools.gap.jobs import KINDS, Job, Result, jobs
 from tools.gap.tables import summary, table, write
 
-_JUDGED = ("disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim")
-_JUDGED_TOO = (
-    "tools/gap/logs.py", "tools/gap/jobs.py", "tools/gap/mujoco.py", "tools/mujoco_robot.py",
-    "tools/gap/strange_robot.py",
+ROOT = Path(__file__).resolve().parents[2]
+JUDGED = (
+    "disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim",
+    "tools/gap/halves.py", "tools/gap/jobs.py", "tools/gap/logs.py", "tools/gap/mujoco.py",
+    "tools/gap/strange_robot.py", "tools/joystick.py", "tools/mujoco_robot.py",
+    "tools/simulated_drives.py", "tools/simulated_log.py",
 )  # fmt: skip
 
 
 def revision() -> str:
     """A short hash of all sources that a result depends on."""
-    root, digest = Path(__file__).parents[2], hashlib.sha256()
-    for name in (*_JUDGED, *_JUDGED_TOO):
-        path = root / name
+    digest = hashlib.sha256()
+    for name in JUDGED:
+        path = ROOT / name
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(file.read_bytes())
     return digest.hexdigest()[:12]
@@ -60,34 +62,22 @@ class Kept:
         path = self._folder / f"{job.key}.json"
         return Result(**json.loads(path.read_text(encoding="utf-8"))) if path.exists() else None
 
-    def all(self) -> list[Result]:
-        """Every result that is kept."""
-        paths = sorted(self._folder.glob("*.json"))
-        return [Result(**json.loads(path.read_text(encoding="utf-8"))) for path in paths]
-
     def put(self, result: Result) -> None:
         """Keep a result."""
         path = self._folder / f"{'-'.join([result.kind, *result.hidden, str(result.seed)])}.json"
         write_whole(path, json.dumps(asdict(result)))
 
 
-def run(todo: Sequence[Job], processes: int, dask: str | None) -> Iterator[Result]:
-    """Results as they come, on some processes or on a dask cluster."""
-    if dask is not None:
-        # Only who has a cluster has dask.
-        from dask.distributed import Client, as_completed  # noqa: PLC0415
-
-        with Client(dask) as client:
-            for future in as_completed(client.map(gap_jobs.work, todo, pure=False)):
-                yield future.result()
-    elif processes == 1:
+def run(todo: Sequence[Job], processes: int) -> Iterator[Result]:
+    """Results as they come, on some processes."""
+    if processes == 1:
         yield from map(gap_jobs.work, todo)
     else:
         with get_context("spawn").Pool(processes) as pool:
             yield from pool.imap_unordered(gap_jobs.work, todo)
 
 
-def study(todo: Sequence[Job], out: Path, processes: int, dask: str | None, console: Console) -> list[Result]:
+def study(todo: Sequence[Job], out: Path, processes: int, console: Console) -> list[Result]:
     """All jobs' results, from before or new; what is written is up to date after every log."""
     code = revision()
     kept = Kept(out / "results" / code)
@@ -102,7 +92,7 @@ def study(todo: Sequence[Job], out: Path, processes: int, dask: str | None, cons
     )  # fmt: skip
     with Progress(*columns, console=console) as progress:
         task = progress.add_task("searching", total=len(todo), completed=len(results))
-        for result in run(new, processes, dask):
+        for result in run(new, processes):
             kept.put(result)
             results.append(result)
             progress.advance(task)
@@ -119,10 +109,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=10, help="logs of each hidden effect (10)")
     parser.add_argument("--first", type=int, default=1, help="first seed (1)")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1, help="processes (all cores)")
-    parser.add_argument("--dask", metavar="ADDRESS", help="scheduler of a dask cluster to run on instead")
-    parser.add_argument(
-        "--so-far", action="store_true", help="search nothing: tables of all that is kept for this code"
-    )
     parser.add_argument("-o", "--out", type=Path, default=Path("out/gap_study"), help="directory to write to")
     options = parser.parse_args(arguments)
     unknown = set(options.kinds) - set(KINDS)
@@ -130,12 +116,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"no such kind: {', '.join(sorted(unknown))}; write some of {', '.join(KINDS)}")
     seeds = range(options.first, options.first + options.seeds)
     todo = [job for kind in options.kinds or KINDS for job in jobs(kind, seeds)]
-    console = Console(stderr=True)
-    if options.so_far:
-        results = Kept(options.out / "results" / revision()).all()
-        write(results, options.out, revision())
-    else:
-        results = study(todo, options.out, options.processes, options.dask, console)
+    results = study(todo, options.out, options.processes, Console(stderr=True))
     print("\n".join(table(results)))
     for key, value in summary(results).items():
         print(f"{key:<40} {value:.4g}")

@@ -7,35 +7,105 @@ import sys
 import zlib
 from pathlib import Path
 
-import cantools
+import cantools.database.can
 import msgspec
 from cantools.database.can.c_source import generate
 
-from firmware_protocol.codec import MessageLayout, Protocol, Tables, load_protocol
+from firmware_protocol.layout import MessageLayout, Protocol, SignalLayout
+from firmware_protocol.protection import data_id
 
 ROOT = Path(__file__).resolve().parents[2]
 DBC = ROOT / "firmware_protocol" / "disco_robot.dbc"
 FIRMWARE = ROOT / "firmware_protocol" / "firmware"
 PREFIX = "disco_robot"
+_TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[^\s":;,|@()\[\]]+|[:;,|@()\[\]]')
 
 
 def generated_files(dbc_text: str) -> dict[str, str]:
     """Return the generated files' texts by name: cantools' pack and unpack, and our constants."""
     database = cantools.database.load_string(dbc_text, database_format="dbc")
+    protocol = load_protocol(dbc_text)
     header, source, _, _ = generate(
         database, PREFIX, f"{PREFIX}.h", f"{PREFIX}.c", f"{PREFIX}_fuzzer.c", floating_point_numbers=False
     )
     return {
         f"{PREFIX}.h": _without_date(header),
         f"{PREFIX}.c": _without_date(source),
-        "protocol_constants.h": _constants(load_protocol(dbc_text)),
-        "disco_robot.json": _tables(dbc_text),
+        "protocol_constants.h": _constants(protocol),
+        f"{PREFIX}.json": msgspec.json.format(msgspec.json.encode(protocol)).decode() + "\n",
     }
 
 
-def _tables(dbc_text: str) -> str:
-    tables = Tables(zlib.crc32(dbc_text.encode()), load_protocol(dbc_text))
-    return msgspec.json.format(msgspec.json.encode(tables)).decode() + "\n"
+def dbc_hash(text: str) -> int:
+    """Return the CRC-32 of a DBC without its comments, with one blank between tokens.
+
+    Both ends compare it in the handshake, so that two builds with different layouts or tables never move a wheel.
+    """
+    kept: list[str] = []
+    in_comment = False
+    for token in _TOKEN.findall(text):
+        in_comment = in_comment or token == "CM_"
+        if not in_comment:
+            kept.append(token)
+        elif token == ";":
+            in_comment = False
+    return zlib.crc32(" ".join(kept).encode())
+
+
+def load_protocol(text: str) -> Protocol:
+    """Read a DBC into tables.
+
+    Raises ValueError for a DBC without protocol version, and for what this protocol does not use: big-endian signals
+    and offsets.
+    """
+    database = cantools.database.can.Database()
+    database.add_dbc_string(text)
+    attributes = database.dbc.attributes if database.dbc is not None else {}
+    if not {"ProtocolMajor", "ProtocolMinor"} <= attributes.keys():
+        raise ValueError("the DBC has no attributes ProtocolMajor and ProtocolMinor")
+    major = int(attributes["ProtocolMajor"].value)
+    return Protocol(
+        major=major,
+        minor=int(attributes["ProtocolMinor"].value),
+        dbc_hash=dbc_hash(text),
+        messages=tuple(_message_layout(message, major) for message in database.messages),
+    )
+
+
+def _message_layout(message: cantools.database.can.Message, major: int) -> MessageLayout:
+    any_major = message.dbc.attributes.get("E2EAnyMajor") if message.dbc is not None else None
+    data_id_major = 0 if any_major is not None and int(any_major.value) else major
+    names = {signal.name for signal in message.signals}
+    multiplexers = [signal.name for signal in message.signals if signal.is_multiplexer]
+    return MessageLayout(
+        name=message.name,
+        can_id=message.frame_id,
+        length=message.length,
+        sender=message.senders[0],
+        data_id=data_id(message.frame_id, data_id_major) if {"crc", "counter"} <= names else None,
+        page_signal=multiplexers[0] if multiplexers else None,
+        period_s=message.cycle_time / 1000.0 if message.cycle_time else None,
+        signals=tuple(_signal_layout(signal) for signal in message.signals),
+    )
+
+
+def _signal_layout(signal: cantools.database.can.Signal) -> SignalLayout:
+    if signal.byte_order != "little_endian" or signal.offset != 0:
+        raise ValueError(f"signal {signal.name}: only little-endian signals without offset are used")
+    raw_maximum = (1 << (signal.length - signal.is_signed)) - 1
+    return SignalLayout(
+        name=signal.name,
+        shift=signal.start,
+        width=signal.length,
+        signed=signal.is_signed,
+        is_float=signal.is_float,
+        scale=signal.scale,
+        minimum=signal.minimum if signal.minimum is not None else -(raw_maximum + 1) * signal.is_signed * signal.scale,
+        maximum=signal.maximum if signal.maximum is not None else raw_maximum * signal.scale,
+        unit=signal.unit or "",
+        choices={int(value): str(name) for value, name in (signal.choices or {}).items()},
+        page=signal.multiplexer_ids[0] if signal.multiplexer_ids else None,
+    )
 
 
 def _without_date(text: str) -> str:

@@ -107,7 +107,7 @@ def circle() -> SimulatedRun:
     """DISCO drives, the robot is carried off by 0.2 m, and drives on."""
     stack = _started(simulated(planner()))
     stack.run(1.0)
-    stack.robot.board.kidnap(0.2, 0.1, 0.3)
+    stack.robot.board.plant.kidnap(0.2, 0.1, 0.3)
     stack.run(1.5)
     stack.run(0.6, UserRequest.DISARM)
     return stack

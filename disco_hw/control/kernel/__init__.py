@@ -2,20 +2,7 @@
 
 That is a system's rollout of a block and a task's cost. Samples are the innermost dimension everywhere, in blocks of
 BLOCK: every loop over them becomes vector instructions without a remainder, and a block's commands and state stay in
-the first-level cache. All of it is float32; every row below is of the BLOCK samples of one block (docs/kernel.md says
-what each one costs).
-
-    noise      | knot 0 left | knot 0 right | knot 1 left | ...                         R rows a block
-    commands   | -H left | -H right | ... | -1 right | 0 left | 0 right | ... | T-1 right |   2 (H + T) rows a block
-    wheels     | 0 SUM | 0 DIFFERENCE | 1 SUM | ... | T-1 DIFFERENCE | 0 change | ... | T-1 change |     3 T rows
-    state      |  0 AXLE_X  1 AXLE_Y  2 COS  3 SIN  4 FORWARD |                shared by the points of a rollout
-               |  5 OWN:     X  Y  MEMORY  TOTAL  KEPT  ROW  FOUND x 4 |       the rollout's own point
-               | 15 AHEAD0, 25 AHEAD1, 35 SCALED0, 45 SCALED1 |                as OWN, of its equivalent points
-               |  0 LEFT  1 RIGHT  2 REMEMBERED ... |                          instead, while the wheels are turned
-               | 35 BODY_REMEMBERED ... |                                      instead of SCALED0, where terms remember
-    costs      | sample 0 | sample 1 | ... | sample K'-1 |                     K' samples; point_costs: L times that
-
-SUM is left plus right, DIFFERENCE right minus left. A FOUND is the four numbers of sample 0, then those of sample 1.
+the first-level cache. All of it is float32; docs/kernel.md draws the rows and says what each one costs.
 
 What the functions of a task are is written in disco_hw/tasks; they are chosen by the type of the task's terms.
 """
@@ -189,21 +176,8 @@ def _looks_up(terms: Any) -> Callable[[Any], bool | None] | None:
     return (lambda terms: True) if "table" in fields else (lambda terms: None)
 
 
-@specialise(tasks.norm)
-def _norm(x: Any, y: Any) -> Callable[..., float]:
-    return lambda x, y: fast_norm(x, y)  # noqa: PLW0108 - the compiler wants Python code
-
-
-@specialise(tasks.norm_and_inverse)
-def _norm_and_inverse(x: Any, y: Any) -> Callable[..., tuple[float, float]]:
-    return lambda x, y: fast_norm_and_inverse(x, y)  # noqa: PLW0108 - the compiler wants Python code
-
-
-@specialise(tasks.norm_of_three)
-def _norm_of_three(x: Any, y: Any, z: Any) -> Callable[..., float]:
-    return lambda x, y, z: fast_length(x, y, z)  # noqa: PLW0108 - the compiler wants Python code
-
-
-@specialise(tasks.constant)
-def _constant(value: Any, like: Any) -> Callable[..., float]:
-    return lambda value, like: cast_like(value, like)  # noqa: PLW0108 - the compiler wants Python code
+# The compiler wants Python code, which calls the compiled function.
+specialise(tasks.norm)(lambda x, y: lambda x, y: fast_norm(x, y))  # noqa: PLW0108
+specialise(tasks.norm_and_inverse)(lambda x, y: lambda x, y: fast_norm_and_inverse(x, y))  # noqa: PLW0108
+specialise(tasks.norm_of_three)(lambda x, y, z: lambda x, y, z: fast_length(x, y, z))  # noqa: PLW0108
+specialise(tasks.constant)(lambda value, like: lambda value, like: cast_like(value, like))  # noqa: PLW0108

@@ -1,7 +1,7 @@
 """Costs of a rollout, in the rows of a block's state: of a point and of the points that are equivalent to it.
 
 An equivalent point has the same axle's path, or the same at another scale: it has a tracked point, memory and cost of
-its own, in ten rows of its own (the package's docstring draws them). Pairs of points that are absent are None.
+its own, in ten rows of its own (docs/kernel.md draws them). Pairs of points that are absent are None.
 """
 
 from __future__ import annotations

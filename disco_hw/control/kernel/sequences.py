@@ -88,10 +88,7 @@ def _cos_sin_part(part: float, sign: int) -> tuple[float, float]:
     s0, s1, s2, s3, s4 = _SINE
     cosine = c0 + q * (c1 + q * (c2 + q * (c3 + q * c4)))
     sine = part * (s0 + q * (s1 + q * (s2 + q * (s3 + q * s4))))
-    return (
-        float_from_bits(int32(bits_of_float(cosine) ^ sign)),
-        float_from_bits(int32(bits_of_float(sine) ^ sign)),
-    )
+    return (float_from_bits(int32(bits_of_float(cosine) ^ sign)), float_from_bits(int32(bits_of_float(sine) ^ sign)))
 
 
 @scalar_function

@@ -93,10 +93,8 @@ CostPlaces: TypeAlias = tuple[np.uintp, np.uintp] | None
 class SkidSteer(NamedTuple):
     """A skid-steer robot before its task.
 
-    `start` (11,): x, y relative to the task's origin (m), cos and sin of yaw, left and right wheel speed (rad/s), time
-    (s), the task's memory; how far the ground carries the robot in a step along x and y (m), in proportion to the size
-    of equivalent points, and how far it slides to the left for each metre forward (`model/coefficients.py`). `slides`:
-    None, or anything else if the last three count.
+    `start` (11,): at the package's places START_X to SLIDES_LEFT. `slides`: None, or anything else if the last three
+    count (`Disturbance`); the ground carries equivalent points in proportion to their size.
     `means` (L, n): what the terms of each point remember at the start, of commands first, or None where none remembers.
     `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that

@@ -304,13 +304,7 @@ def refuse_invalid(costs: Floats, samples: int) -> tuple[float, int]:
 
 @block_function
 def weigh(
-    weights: Floats,
-    scratch: Floats,
-    costs: Floats,
-    blocks: int,
-    samples: int,
-    least: float,
-    temperature: float,
+    weights: Floats, scratch: Floats, costs: Floats, blocks: int, samples: int, least: float, temperature: float
 ) -> tuple[float, float]:
     """Unnormalised weights exp(-(cost - least) / temperature); returns their sum and effective sample size.
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -40,75 +40,49 @@ BRANCHES_M = 0.3
 AGAINST_BRANCH_M = 0.6
 
 
-@dataclass(frozen=True, eq=False)
 class PathTable:
-    """Way-points (N, 2) in equal pieces of arc length, of about `nominal_spacing_m`.
+    """Way-points (N, 2) in equal pieces of arc length, of about `nominal_spacing_m`; immutable.
 
     Where the way turns sharply it is cut into pieces: the robot stops at a piece's end and turns to the next. The path
-    is closed if its last way-point is its first. Raises ValueError for way-points closer than the table's spacing
-    throughout.
+    is `closed` if its last way-point is its first. `table`: x, y (m) of each entry, and the unit tangent of the piece
+    that begins there; `spacing_m`: arc length between two entries. Raises ValueError for way-points closer than the
+    table's spacing throughout.
     """
 
-    places_m: Array
-    nominal_spacing_m: float = SPACING_M
-    _table: Array = field(init=False, repr=False)
-    _closed: bool = field(init=False, repr=False)
-    _spacing_m: float = field(init=False, repr=False)
-    _bounds: Array = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        places = self.places_m
-        distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places, axis=0).T))])
-        count = round(distance[-1] / self.nominal_spacing_m)
+    def __init__(self, places_m: Array, nominal_spacing_m: float = SPACING_M) -> None:
+        distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m, axis=0).T))])
+        count = round(distance[-1] / nominal_spacing_m)
         if count < 1:
-            raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {self.nominal_spacing_m} m")
+            raise ValueError(f"the path is {distance[-1]} m long; it must be longer than {nominal_spacing_m} m")
         at = np.linspace(0.0, distance[-1], count + 1)
-        x, y = np.interp(at, distance, places[:, 0]), np.interp(at, distance, places[:, 1])
+        x, y = np.interp(at, distance, places_m[:, 0]), np.interp(at, distance, places_m[:, 1])
         # Where the way turns straight back between two entries they may coincide, and there would be no direction: the
         # first of them moves out to the way-point at which it turns.
         (folds,) = np.nonzero(np.hypot(np.diff(x), np.diff(y)) < FOLDED * distance[-1] / count)
         turns = np.searchsorted(distance, at[folds], side="right")
-        x[folds], y[folds] = places[turns].T
-        closed = bool(np.hypot(*(places[0] - places[-1])) < self.nominal_spacing_m)
-        spacing = float(distance[-1]) / count
-        corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / spacing)))
+        x[folds], y[folds] = places_m[turns].T
+        self.closed = closed = bool(np.hypot(*(places_m[0] - places_m[-1])) < nominal_spacing_m)
+        self.spacing_m: float = float(distance[-1]) / count
+        corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / self.spacing_m)))
         x, y = _rounded(np.column_stack([x, y]), closed).T
         step_x, step_y = np.diff(x), np.diff(y)
         length = np.maximum(np.hypot(step_x, step_y), 1e-12)
         along_x = np.append(step_x / length, (step_x / length)[0 if closed else -1])
         along_y = np.append(step_y / length, (step_y / length)[0 if closed else -1])
-        table = np.column_stack([x, y, along_x, along_y])
+        self.table = np.column_stack([x, y, along_x, along_y])
         bounds = [*corners, *(corner + count for corner in corners[:1])] if closed else [0, *corners, count]
-        object.__setattr__(self, "_table", table)
-        object.__setattr__(self, "_closed", closed)
-        object.__setattr__(self, "_spacing_m", spacing)
-        object.__setattr__(self, "_bounds", np.array(bounds, dtype=float))
-
-    @property
-    def table(self) -> Array:
-        """The path in equal pieces of arc length: x, y (m) and the unit tangent of the piece that begins there."""
-        return self._table
-
-    @property
-    def closed(self) -> bool:
-        """Whether the path's end is its beginning."""
-        return self._closed
+        self._bounds = np.array(bounds, dtype=float)
 
     @property
     def sharp_turns(self) -> tuple[int, ...]:
         """Entries of the table at which the robot stops to turn."""
-        ends = slice(0, -1) if self._closed else slice(1, -1)
+        ends = slice(0, -1) if self.closed else slice(1, -1)
         return tuple(self._bounds.astype(int)[ends].tolist())
 
     @property
     def ends(self) -> bool:
         """Whether rollouts end somewhere: at the path's end or before a sharp turn."""
         return bool(self._bounds.size)
-
-    @property
-    def spacing_m(self) -> float:
-        """Arc length between two entries of the table."""
-        return self._spacing_m
 
     def piece(self, place: float) -> tuple[float, float, float]:
         """Return the piece that a place is on: the place, not less than the piece's first entry.
@@ -118,10 +92,10 @@ class PathTable:
         A piece of a closed path may go past the table's end, and so may the place. A path without sharp turns is one
         piece; of a closed one, which has no end, the last entry is the first again.
         """
-        bounds, count = self._bounds, len(self._table) - 1
+        bounds, count = self._bounds, len(self.table) - 1
         if not bounds.size:
             return place % count, 0.0, float(count)
-        if self._closed:
+        if self.closed:
             place = place % count
             place += count if place < bounds[0] else 0.0
         at = min(int(np.searchsorted(bounds, place, side="right")), bounds.size - 1)
@@ -133,39 +107,39 @@ class PathTable:
         Near the one before means on the same piece; at the end of a piece the next one begins. Where several branches
         pass by, the first place is on the one that the heading fits.
         """
-        count, spacing = len(self._table) - 1, self._spacing_m
+        count, spacing = len(self.table) - 1, self.spacing_m
         if before is not None:
             here, first, last = self.piece(before)
             low, high = round(here - LOOK_BACK_M / spacing), round(here + LOOK_AHEAD_M / spacing)
             if self._bounds.size:
                 low, high = max(low, int(first)), min(high, int(last))
             if low >= 0 and high <= count:
-                rows = self._table[low : high + 1]
+                rows = self.table[low : high + 1]
             else:
-                rows = self._table[np.arange(low, high + 1) % count]
+                rows = self.table[np.arange(low, high + 1) % count]
             square = (rows[:, 0] - x_m) ** 2 + (rows[:, 1] - y_m) ** 2
             nearest = int(square.argmin())
             if square[nearest] < LOST_M**2:
                 found = float(low + nearest)
-                if self._bounds.size and (self._closed or last < count) and (last - found) * spacing <= REACHED_M:
+                if self._bounds.size and (self.closed or last < count) and (last - found) * spacing <= REACHED_M:
                     found = last
-                return found % count if self._closed else found
+                return found % count if self.closed else found
         return float(self._branch(x_m, y_m, yaw_rad))
 
     def _branch(self, x_m: float, y_m: float, yaw_rad: float) -> int:
         """Entry where the branch is nearest whose distance and direction together fit a pose best."""
-        distance = np.hypot(self._table[:, 0] - x_m, self._table[:, 1] - y_m)
+        distance = np.hypot(self.table[:, 0] - x_m, self.table[:, 1] - y_m)
         nearest = int(np.argmin(distance))
         if not (math.isfinite(yaw_rad) and math.isfinite(distance[nearest])):
             return nearest
-        if self._closed:
+        if self.closed:
             before, after = np.roll(distance[:-1], 1), np.roll(distance[:-1], -1)
             before, after = np.append(before, before[0]), np.append(after, after[0])
         else:
             before, after = np.append(np.inf, distance[:-1]), np.append(distance[1:], np.inf)
         branches = np.flatnonzero((distance <= before) & (distance < after))
         branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
-        along = self._table[branches, 2] * math.cos(yaw_rad) + self._table[branches, 3] * math.sin(yaw_rad)
+        along = self.table[branches, 2] * math.cos(yaw_rad) + self.table[branches, 3] * math.sin(yaw_rad)
         return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
 
 

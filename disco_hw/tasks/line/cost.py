@@ -85,12 +85,6 @@ class PathCost:
         """Return the path as points (N, 2)."""
         return self.path.table[:, :2]
 
-    def instant_cost(self, time_s: float, x_m: float, y_m: float, forward_m_s: float) -> float:
-        """Distance to the path and error of the longitudinal speed, as one length."""
-        table = self.path.table
-        distance = np.hypot(table[:, 0] - x_m, table[:, 1] - y_m).min()
-        return math.hypot(float(distance), forward_m_s - self.speed_m_s)
-
 
 class PathTerms(NamedTuple):
     """The cost along the part of a path's table that can be reached within the horizon.

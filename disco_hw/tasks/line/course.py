@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from disco_hw.errors import InputError
-from disco_hw.tasks import SLOWEST_M_S, Array, Chassis, Editable, Point
+from disco_hw.tasks import SLOWEST_M_S, Array, Chassis, Editable, Point, too_fast
 from disco_hw.tasks.line import SHARP_RAD, PathTable, Waypoints
 
 if TYPE_CHECKING:
@@ -165,13 +165,7 @@ def straight_fastest_m_s(robot: Chassis) -> float:
 
 def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
     """Return why the wheels cannot do a speed straight ahead, and the remedy; None if they can."""
-    fastest = straight_fastest_m_s(robot)
-    if speed_m_s <= fastest:
-        return None
-    return (
-        f"{speed_m_s:g} m/s needs more than {robot.max_wheel_speed_rad_s:g} rad/s of the wheels; write at most "
-        f"{math.floor(fastest * 1000.0) / 1000.0:g} m/s"
-    )
+    return too_fast(speed_m_s, straight_fastest_m_s(robot), robot, "the wheels")
 
 
 def speed_range(robot: Chassis) -> Mapping[str, Editable]:

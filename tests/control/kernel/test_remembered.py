@@ -14,6 +14,7 @@ from disco_hw.model import EffectSetting, Gaussian, Model, plain
 from disco_hw.model.terms import BODY_MEMORIES, COMMAND_MEMORIES
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
+from tests.model import features
 from tests.tasks.costs import circle_cost
 
 SAMPLES, HORIZON, STEP_S = 160, 30, 0.1
@@ -56,10 +57,11 @@ def remembered(theta):
     means = {RUBBER: (radius / axial * BODY[RUBBER],), PITCH: (0.5 * radius * BODY[PITCH],)}
     until_s = 1e-9 * TICK_NS * len(SENT) - float(np.mean(theta["command_delay.delay_s"]))
     for name, begin in BEFORE.items():
-        memory, mean = plain.COMMAND_MEMORIES[name], np.array(begin)
+        mean = np.array(begin)
         for k, command in enumerate(SENT):
             held_s = min(max(until_s - 1e-9 * TICK_NS * k, 0.0), 1e-9 * TICK_NS)
-            mean = memory.after(mean, memory.goes_in(command, command[::-1]), held_s)
+            goes_in = features.goes_in(name, u=command, u_other=command[::-1])
+            mean = features.after(name, mean, goes_in, held_s)
         means[name] = tuple(mean)
     return means
 

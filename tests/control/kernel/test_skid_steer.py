@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, Sampler, SentCommand
 from disco_hw.control.kernel import BLOCK
+from disco_hw.control.kernel.step import ESS, NOMINAL, TEMPERATURE
 from disco_hw.control.optimiser import spline_basis
 from disco_hw.control.parameter_points import unscented_points
 from disco_hw.control.plan import command_history
@@ -156,7 +157,7 @@ def sampled_commands(disco, before, sampler, state):
     assert np.all(np.abs(anchor - (last.left_rad_s, last.right_rad_s)) <= 12.0)
     change = LIMITS.acceleration_rad_s2 * STEP_S
     commands = oracle.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
-    if disco._guidance.is_made:
+    if disco._guidance._guide is not None:
         # What the guide is has its own tests.
         commands[1] = work.guide
     return commands
@@ -170,7 +171,7 @@ def check_against_reference(model, state, task, plan_settings, seed):
     disco.plan(now_ns, state)
     work = disco.optimiser.work
 
-    sampler, guided = plan_settings.sampler, disco._guidance.is_made
+    sampler, guided = plan_settings.sampler, disco._guidance._guide is not None
     commands = sampled_commands(disco, before, sampler, state)
 
     theta, point_weights = unscented_points(model, plan_settings.ut_alpha)
@@ -224,10 +225,9 @@ def check_against_reference(model, state, task, plan_settings, seed):
 
     mean = oracle.mean_risk(np.where(excused, got, expected), point_weights[weighed])
     np.testing.assert_allclose(work.costs[: sampler.samples], mean, atol=1e-4, rtol=RELATIVE)
-    report = disco.optimiser.report()
-    assert report["cost_nominal"] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
-    kernel_weights = oracle.softmax_weights(work.costs[: sampler.samples].astype(float), report["temperature"])
-    assert report["ess"] == pytest.approx(oracle.effective_sample_size(kernel_weights), rel=1e-3)
+    assert work.report[NOMINAL] == pytest.approx(mean[0], abs=1e-4, rel=RELATIVE)
+    kernel_weights = oracle.softmax_weights(work.costs[: sampler.samples].astype(float), work.report[TEMPERATURE])
+    assert work.report[ESS] == pytest.approx(oracle.effective_sample_size(kernel_weights), rel=1e-3)
     # That the guide has the robot where the plan stands has its own test.
     cheaper = work.costs[1] < plan_settings.guide_below * work.costs[0]
     taken = guided and (cheaper or disco._guidance.until_ns is not None)
@@ -270,9 +270,9 @@ def slid(cost, point, mean, found):
     return slid_cost
 
 
-@examples(
-    quick=6,
-    every=15,
+@pytest.mark.thorough
+@settings(max_examples=15)
+@given(
     base=SLOW_TURNING,
     values=STATES,
     commands=COMMANDS,

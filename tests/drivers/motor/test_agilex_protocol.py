@@ -4,8 +4,11 @@ import pytest
 from hypothesis import strategies as st
 
 from drivers.motor import agilex_protocol as protocol
-from drivers.types import Frame
+from drivers.motor import create_driver
+from drivers.types import Frame, ReceivedFrame
 from tests.tables import examples
+
+SETTINGS = protocol.AgilexSettings(wheel_radius_m=0.06, track_m=0.31, max_speed_m_s=1.5)
 
 
 def test_a_motion_command_is_in_thousandths():
@@ -34,13 +37,25 @@ def test_the_state_and_the_odometry_are_read():
     assert odometry.values == {"left_mm": 2**24 + 1, "right_mm": -1}
 
 
-def test_each_motor_has_its_own_identifier():
-    motor = protocol.decode(Frame(0x254, bytes.fromhex("ff9c000a00000064")))
-    assert motor is not None
-    assert (motor.node, motor.values["rpm"], motor.values["pulses"]) == (3, -100, 100)
+@pytest.mark.parametrize(
+    ("frame", "expected"),
+    [
+        (Frame(0x254, bytes(8)), "frames_accepted"),
+        (Frame(0x362, bytes(8)), "frames_accepted"),
+        (Frame(0x254, bytes(7)), "rejected_length"),
+        (Frame(0x211, bytes(7)), "rejected_length"),
+        (Frame(0x259, bytes(8)), "unknown_id"),
+        (Frame(0x254, bytes(8), extended=True), "unknown_id"),
+    ],
+)
+def test_messages_without_a_use_are_known_all_the_same(frame, expected):
+    driver = create_driver("agilex", SETTINGS)
+    driver.link_up(0)
+    driver.receive(0, [ReceivedFrame(0, frame)])
+    assert getattr(driver.stats, expected) == 1
 
 
-@pytest.mark.parametrize("can_id", [0x211, 0x221, 0x251, 0x311])
+@pytest.mark.parametrize("can_id", [0x211, 0x221, 0x311])
 def test_a_short_frame_is_none(can_id):
     assert protocol.decode(Frame(can_id, bytes(7))) is None
 

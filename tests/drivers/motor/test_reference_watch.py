@@ -5,7 +5,7 @@ import itertools
 import pytest
 
 from drivers.motor.reference import ReferenceDriver
-from drivers.motor.reference_arming import DELAY_NS, STATE_TIMEOUT_NS, ArmedWatch, CommandEcho
+from drivers.motor.reference_arming import DELAY_NS, STATE_TIMEOUT_NS, ArmedWatch
 from drivers.types import DriverState
 from firmware_protocol.codec import Codec
 from tests.drivers.motor.bench import MS, Bench
@@ -108,42 +108,47 @@ def test_armed_it_goes_on_hearing_the_robots_state_or_stops(missing):
 PERIOD_NS = 20_000_000
 
 
-def echo_of(count, first=0):
-    echo = CommandEcho()
+def watch_after(count, first=0):
+    watch = ArmedWatch()
     for number in range(first, first + count):
-        echo.sent(number, number * PERIOD_NS)
-    return echo
+        watch.sent(number, number * PERIOD_NS)
+    return watch
+
+
+def delay_ns(watch, counter, received_ns):
+    watch.reported(counter, received_ns)
+    return watch.delay_ns
 
 
 def test_the_oldest_command_not_taken_says_how_late_the_robot_is():
-    assert echo_of(10).delay_ns(9, 10 * PERIOD_NS) == 0
-    assert echo_of(10).delay_ns(7, 10 * PERIOD_NS) == 2 * PERIOD_NS
-    assert CommandEcho().delay_ns(5, 10 * PERIOD_NS) == 0
+    assert delay_ns(watch_after(10), 9, 10 * PERIOD_NS) == 0
+    assert delay_ns(watch_after(10), 7, 10 * PERIOD_NS) == 2 * PERIOD_NS
+    assert delay_ns(ArmedWatch(), 5, 10 * PERIOD_NS) == 0
 
 
 def test_none_taken_since_the_beginning():
-    assert echo_of(5, first=100).delay_ns(99 % 16, 105 * PERIOD_NS) == 5 * PERIOD_NS
+    assert delay_ns(watch_after(5, first=100), 99 % 16, 105 * PERIOD_NS) == 5 * PERIOD_NS
 
 
 def test_the_counter_is_followed_past_its_wrap():
-    echo = CommandEcho()
+    watch = ArmedWatch()
     for number in range(200):
-        echo.sent(number, number * PERIOD_NS)
+        watch.sent(number, number * PERIOD_NS)
         behind = number // 5
         if number % 5 == 4:
-            assert echo.delay_ns((number - behind) % 16, (number + 1) * PERIOD_NS) == behind * PERIOD_NS
+            assert delay_ns(watch, (number - behind) % 16, (number + 1) * PERIOD_NS) == behind * PERIOD_NS
 
 
 def test_a_gap_in_telemetry_is_no_lateness():
-    echo = echo_of(1)
-    assert echo.delay_ns(0, PERIOD_NS) == 0
+    watch = watch_after(1)
+    assert delay_ns(watch, 0, PERIOD_NS) == 0
     for number in range(1, 40):
-        echo.sent(number, number * PERIOD_NS)
-    assert echo.delay_ns(38 % 16, 40 * PERIOD_NS) == PERIOD_NS
+        watch.sent(number, number * PERIOD_NS)
+    assert delay_ns(watch, 38 % 16, 40 * PERIOD_NS) == PERIOD_NS
 
 
 def test_what_was_sent_before_does_not_count_after_forgetting():
-    echo = echo_of(10)
-    echo.clear()
-    echo.sent(10, 500 * PERIOD_NS)
-    assert echo.delay_ns(5, 501 * PERIOD_NS) == PERIOD_NS
+    watch = watch_after(10)
+    watch.rest()
+    watch.sent(10, 500 * PERIOD_NS)
+    assert delay_ns(watch, 5, 501 * PERIOD_NS) == PERIOD_NS

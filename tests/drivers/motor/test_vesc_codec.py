@@ -5,7 +5,13 @@ from hypothesis import strategies as st
 
 from drivers.motor import vesc_codec as codec
 from drivers.types import Frame
+from sim.devices.vesc_firmware import can_packet
 from tests.tables import examples
+
+
+def fragments(payload):
+    """The frames in which controller 23 answers to 200."""
+    return [Frame(each.can_id, each.data, extended=True) for each in can_packet(200, 23, payload, 1)]
 
 
 def test_the_documented_frames():
@@ -42,7 +48,7 @@ def test_a_pong_names_who_is_there():
 
 def test_a_fault_is_read_from_an_answer_in_fragments():
     payload = bytes.fromhex("32002080000501")
-    frames = codec.fragments(200, 23, payload, send_mode=1)
+    frames = fragments(payload)
     assert [frame.can_id >> 8 for frame in frames] == [5, 7]
     reassembly = codec.Reassembly(200)
     assert [reassembly.feed(frame) for frame in frames] == [None, (23, 1, payload)]
@@ -50,17 +56,17 @@ def test_a_fault_is_read_from_an_answer_in_fragments():
 
 
 def test_a_lost_fragment_is_no_packet():
-    frames = codec.fragments(200, 23, bytes(range(1, 40)), send_mode=1)
+    frames = fragments(bytes(range(1, 40)))
     reassembly = codec.Reassembly(200)
     assert [reassembly.feed(frame) for frame in (*frames[:2], *frames[3:])][-1] is None
 
 
 @pytest.mark.parametrize("length", [1, 7, 255, 256, 512])
-def test_a_packet_comes_back_whole_however_it_is_cut(length):
+def test_a_packet_is_found_once_its_last_byte_is_there(length):
     payload = bytes(k % 251 for k in range(length))
-    decoder = codec.PacketDecoder()
-    found = [packet for byte in codec.packet(payload) for packet in decoder.feed(bytes([byte]))]
-    assert (found, decoder.skipped) == ([payload], 0)
+    packet = codec.packet(payload)
+    assert [codec.packets(packet[:n]) for n in range(len(packet))] == [[]] * len(packet)
+    assert codec.packets(packet + packet) == [payload, payload]
 
 
 @pytest.mark.parametrize("length", [0, 513])
@@ -71,11 +77,8 @@ def test_a_payload_that_no_packet_holds_is_refused(length):
 
 @examples(quick=40, every=100, noise=st.binary(max_size=60))
 def test_noise_costs_no_later_packet(noise):
-    decoder = codec.PacketDecoder()
-    decoder.feed(noise)
     # However long a packet the noise has announced, zeros end it.
-    decoder.feed(bytes(codec.MAX_PAYLOAD + 6))
-    assert decoder.feed(codec.packet(b"\x1e")) == [b"\x1e"]
+    assert codec.packets(noise + bytes(codec.MAX_PAYLOAD + 6) + codec.packet(b"\x1e"))[-1:] == [b"\x1e"]
 
 
 @examples(
@@ -90,4 +93,5 @@ def test_no_bytes_break_a_decoder(can_id, data, extended, payload):
     frame = Frame(can_id, data, extended)
     codec.decode(frame)
     codec.Reassembly(can_id & 0xFF).feed(frame)
-    codec.values(payload)
+    codec.values(bytes([codec.GET_VALUES_SELECTIVE]) + payload)
+    codec.packets(payload)

@@ -61,7 +61,7 @@ def test_a_flood_of_refused_datagrams_is_reported_once_in_ten_seconds_with_their
 
 
 def test_made_up_addresses_do_not_fill_the_memory():
-    gate = SenderGate(allowed=parse_allowed(["10.0.0.1"]))
+    gate = SenderGate(allow=["10.0.0.1"])
     for number in range(5000):
         assert not gate.may_send((f"172.16.{number // 256}.{number % 256}", 9), 0)
     assert len(gate._known) <= 1001
@@ -80,8 +80,6 @@ def test_made_up_addresses_do_not_fill_the_memory():
 def test_what_is_no_address_is_refused(addresses, expected_error):
     with pytest.raises(ValueError, match=expected_error):
         parse_allowed(addresses)
-    with pytest.raises(PoseSourceError, match=rf"pose\.allow: .*{expected_error}"):
-        create_pose_source("udp", port=free_port(socket.SOCK_DGRAM), allow=addresses)
 
 
 @pytest.mark.parametrize(

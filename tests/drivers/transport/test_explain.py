@@ -4,7 +4,7 @@ import can
 import pytest
 import serial
 
-from drivers.transport.can import explain_can
+from drivers.transport.can import CanMedium
 from drivers.transport.serial import error_number, explain_port
 
 
@@ -42,15 +42,15 @@ def test_serial_port(error, expected_text):
     ],
 )
 def test_can_bus(interface, error, expected_text):
-    text = explain_can(interface, "can0", 250_000, error)
+    text = CanMedium(interface, "can0", 250_000).explain(error)
     assert expected_text in text
     assert "\n" not in text
 
 
 def test_a_virtual_interface_has_no_bit_rate():
-    absent = explain_can("socketcan", "vcan0", 500_000, OSError(errno.ENODEV, "No such device"))
+    absent = CanMedium("socketcan", "vcan0", 500_000).explain(OSError(errno.ENODEV, "No such device"))
     assert absent.endswith("sudo ip link add dev vcan0 type vcan && sudo ip link set vcan0 up")
-    down = explain_can("socketcan", "vcan0", 500_000, OSError(errno.ENETDOWN, "down"))
+    down = CanMedium("socketcan", "vcan0", 500_000).explain(OSError(errno.ENETDOWN, "down"))
     assert down.endswith("run: sudo ip link set vcan0 up")
 
 
