@@ -23,9 +23,12 @@ from disco_hw.control.plan import ROTATION
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence import Fence, Footprint
+from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.runtime.assembly import apply_geometry
+from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
 from disco_hw.runtime.pipeline import FollowTask, Governor, Pipeline, Planner, WheelLimits
 from disco_hw.tasks import PlannedTask
 from disco_hw.tasks.circle import CircleCost, CircleCourse
@@ -213,7 +216,10 @@ def drive(
     governor = Governor(WheelLimits(LIMITS.speed_rad_s, *[LIMITS.acceleration_rad_s2] * 2), period_s)
     planner = contender.planner(robot, track)
     disturbance = DisturbanceEstimator() if contender.offset_free else None
-    pipeline = Pipeline(fusion(mean, spread), planner, governor, 0.2, disturbance)
+    no_fence = FenceGuard(
+        Boundaries(Footprint(0.5, 0.4, 0.0), Fence()), StoppingSettings(0.1, 0.1, 20.0, period_s), 0.0
+    )
+    pipeline = Pipeline(fusion(mean, spread), planner, governor, 0.2, no_fence, disturbance)
     adaptation = _learner(robot, pipeline, contender.offset_free) if contender.learns else NoAdaptation()
     every_ms = round(1e3 * period_s)
     rows: list[tuple[float, ...]] = []

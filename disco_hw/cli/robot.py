@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -22,21 +22,30 @@ from disco_hw.cli.options import (
 )
 from disco_hw.config import check_named_files
 from disco_hw.errors import InputError
-from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, PageProcess
+from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, page_in_background
 
 PagePort = Annotated[int, typer.Option("--port", min=1, max=65535, help="Port of the page.")]
 
 
+@contextmanager
 def _page(
     view: bool, robot: Path, model: Path | None, port: int, link: str | None
-) -> AbstractContextManager[PageProcess | None]:
-    from disco_hw.viewer import page_in_background
+) -> Iterator[Callable[[], tuple[str, ...]]]:
+    """Serve the page meanwhile if `view`; yields a function that says what happened to it since the last call."""
+    if not view:
+        yield lambda: ()
+        return
+    with page_in_background(robot, model, LOOPBACK, port, link) as page:
+        yield page.new_messages
 
-    return page_in_background(robot, model, LOOPBACK, port, link) if view else nullcontext()
 
+def _prepare_loop() -> None:
+    """Prepare this process for the control loop, before the numeric libraries are loaded."""
+    from disco_hw.processes import limit_thread_pools, spare_memory
 
-def _no_messages() -> tuple[str, ...]:
-    return ()
+    # A pool of threads in them costs the loop its deadlines.
+    limit_thread_pools()
+    spare_memory()
 
 
 def run(
@@ -55,18 +64,14 @@ def run(
     as_json: AsJson = False,
 ) -> None:
     """Run the on-robot daemon: connect, estimate, record; arm and start only when told to (`disco-hw ctl`)."""
-    from disco_hw.processes import limit_thread_pools, spare_memory
-
-    # Before the numeric libraries are loaded: a pool of threads in them costs the loop its deadlines.
-    limit_thread_pools()
-    spare_memory()
+    _prepare_loop()
     check_named_files(robot, model)
     from disco_hw.daemon.run import DaemonOptions, run_daemon
     from disco_hw.drive.hand_pilot import task_pilot
 
-    with _page(view, robot, model, port, link) as page:
+    with _page(view, robot, model, port, link) as page_messages:
         options = DaemonOptions(robot, model, link, log_file, as_json, accept_missing_effects, adapt)
-        code = run_daemon(options, task_pilot, page_messages=_no_messages if page is None else page.new_messages)
+        code = run_daemon(options, task_pilot, page_messages=page_messages)
     raise typer.Exit(code)
 
 
@@ -96,14 +101,11 @@ def drive(
     as_json: AsJson = False,
 ) -> None:
     """Drive by keyboard, gamepad or script, and record it for `infer` and `gap` (docs/drive.md)."""
-    from disco_hw.processes import limit_thread_pools, spare_memory
-
-    limit_thread_pools()
-    spare_memory()
+    _prepare_loop()
     check_named_files(robot, model)
     from disco_hw.drive.drive_command import DriveOptions, run_drive
 
-    with _page(view or page, robot, model, port, link) as served:
+    with _page(view or page, robot, model, port, link) as page_messages:
         result = run_drive(
             DriveOptions(
                 robot=robot,
@@ -119,7 +121,7 @@ def drive(
                 seed=seed,
                 as_json=as_json,
             ),
-            _no_messages if served is None else served.new_messages,
+            page_messages,
         )
     print_result(result.as_dict(), as_json, result.as_text())
     if not result.completed:
@@ -194,10 +196,7 @@ def commission(
     as_json: AsJson = False,
 ) -> None:
     """Guide the first drive: wheels up, then on the floor; finds wrong wiring, ticks and poses (docs/commission.md)."""
-    from disco_hw.processes import limit_thread_pools, spare_memory
-
-    limit_thread_pools()
-    spare_memory()
+    _prepare_loop()
     check_named_files(robot)
     from disco_hw.first_use.commission import CommissionOptions, run_commission
 
@@ -243,11 +242,7 @@ def ctl(
         raise typer.Exit(1)
 
 
-def check(
-    robot: RobotFile,
-    link: LinkOption = None,
-    as_json: AsJson = False,
-) -> None:
+def check(robot: RobotFile, link: LinkOption = None, as_json: AsJson = False) -> None:
     """Check link, firmware match, latency, bus load, real-time settings and limits before a drive.
 
     Nothing moves.
@@ -263,11 +258,7 @@ def check(
         raise typer.Exit(1)
 
 
-def estop(
-    robot: RobotFile,
-    link: LinkOption = None,
-    as_json: AsJson = False,
-) -> None:
+def estop(robot: RobotFile, link: LinkOption = None, as_json: AsJson = False) -> None:
     """Stop the robot now, whatever state the daemon is in."""
     from disco_hw.daemon.emergency import stop_and_report
 

@@ -101,24 +101,22 @@ def sim(
     if robot is None:
         raise InputError("sim: no ROBOT.toml given; name one, such as disco_hw/robots/wombot.toml")
     check_named_files(robot, model)
-    from disco_hw.experiments.virtual import SimOptions, run_sim
+    from disco_hw.experiments.virtual import run_sim
 
     raise typer.Exit(
         run_sim(
-            SimOptions(
-                robot=robot,
-                model=model,
-                link=link,
-                hide=tuple(hide or ()),
-                plant_seed=plant_seed,
-                start=start,
-                truth=truth,
-                inject=inject,
-                bus_log=bus_log,
-                faults=faults,
-                seed=seed,
-                board=board,
-            )
+            robot,
+            model=model,
+            link=link,
+            hide=tuple(hide or ()),
+            plant_seed=plant_seed,
+            start=start,
+            truth=truth,
+            inject=inject,
+            bus_log=bus_log,
+            faults=faults,
+            seed=seed,
+            board=board,
         )
     )
 

@@ -151,16 +151,7 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     def convention(self) -> PoseConvention:
         """Return the units and axes in which the source reports poses."""
-        return PoseConvention(
-            self.position_unit,
-            self.yaw_unit,
-            self.clockwise,
-            self.mirrored,
-            self.yaw_offset_rad,
-            self.origin,
-            self.offset,
-            self.latency_s,
-        )
+        return msgspec.convert(self, PoseConvention, from_attributes=True)
 
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -187,8 +187,7 @@ def _check_pose_fields(path: Path, section: Any) -> None:
         if one is not section and "also" in one:
             _refuse(path, f"{where}.also", "sources are not nested", "write another [[pose.also]]")
         if one is not section and "rate_hz" in one:
-            fault = "says whether the geometry is learnt, which it is from the poses of [pose] alone"
-            _refuse(path, f"{where}.rate_hz", fault, "remove it")
+            _refuse(path, f"{where}.rate_hz", "decides nothing any more", "remove it")
 
 
 def _refuse(path: Path, field: str, fault: str, hint: str) -> NoReturn:

@@ -231,9 +231,7 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     """Send one request to the daemon of `robot`, and return its reply.
 
     `changes`: the request's further words, such as "radius_m=0.8"; `task`, `obstacle` and `fence` need them, and no
-    other request takes any.
-
-    `unrecorded`, for `arm` alone: arm even though nothing is recorded that should be.
+    other request takes any. `unrecorded`, for `arm` alone: arm even though nothing is recorded that should be.
 
     Raises InputError for an unknown action and for changes that are none, and WorkError without a daemon; for an e-stop
     with what stops the robot all the same.
@@ -314,7 +312,7 @@ def describe(reply: dict[str, Any], robot: Path) -> str:
         f"loop lateness p99 {loop['lateness_us']['p99']:.0f} us, max {loop['lateness_us']['max']:.0f} us, "
         f"overruns {loop['overruns']}, skipped {loop['skipped']}",
     ]
-    lines += _describe_fence(reply.get("area"))
+    lines += _describe_fence(reply["area"])
     adaptation = reply.get("adaptation")
     if adaptation is not None:
         paused = ", paused" if adaptation["paused"] else ""
@@ -336,9 +334,9 @@ def describe(reply: dict[str, Any], robot: Path) -> str:
     return "\n".join(lines)
 
 
-def _describe_fence(area: Mapping[str, Any] | None) -> Iterator[str]:
+def _describe_fence(area: Mapping[str, Any]) -> Iterator[str]:
     """Yield lines on fence and obstacles from a status; none where there is no fence."""
-    if area is None or area["verdict"] == "idle":
+    if area["verdict"] == "idle":
         return
     reason = f", {area['reason']}" if area["reason"] else ""
     left = "" if area["clearance_m"] is None else f"; {area['clearance_m']:.2f} m left on the stopping path"

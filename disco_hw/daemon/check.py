@@ -39,8 +39,6 @@ from drivers.motor import find_driver
 from drivers.types import (
     Driver,
     DriverState,
-    Identity,
-    Limits,
     LinkState,
     MessageSource,
     OutgoingFrame,
@@ -114,10 +112,11 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
                 checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
             checks += pose_source_checks(setup.config.pose, found.poses)
-            if found.limits is not None:
-                checks += check_firmware_limits(setup.config.robot, found.limits)
-                checks.append(check_command_timing(control, found.limits))
-                checks.append(check_watchdog(found.limits))
+            limits = found.driver.limits
+            if limits is not None:
+                checks += check_firmware_limits(setup.config.robot, limits)
+                checks.append(check_command_timing(control, limits))
+                checks.append(check_watchdog(limits))
     finally:
         transport.close()
         pose_source.close()
@@ -128,11 +127,8 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
 class _Found:
     """Replies of the robot during a check; `pose_message` is the pose source's newest message, or empty."""
 
-    state: DriverState
+    driver: Driver
     detail: str
-    identity: Identity | None
-    limits: Limits | None
-    clock_synchronised: bool
     wheel_samples: int
     poses: tuple[PoseSample, ...]
     pose_message: str
@@ -220,11 +216,8 @@ def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) 
         time.sleep(_STEP_S)
     stats = driver.stats
     return _Found(
-        state=driver.state,
+        driver=driver,
         detail=connection(transport.state, transport.last_error, driver.state, driver.detail),
-        identity=driver.identity,
-        limits=driver.limits,
-        clock_synchronised=driver.clock_offset_ns is not None,
         wheel_samples=wheels,
         poses=tuple(poses),
         pose_message=pose_message,
@@ -308,16 +301,17 @@ class _Stopwatch:
 def _firmware_check(found: _Found, has_clock: bool) -> Check:
     """Fail if the robot did not identify itself, or is refused, faulty or in e-stop; `has_clock`: report clock sync."""
     name = "firmware"
-    if found.identity is None:
+    identity, state = found.driver.identity, found.driver.state
+    if identity is None:
         return Check(name, Level.FAIL, found.detail)
-    if found.state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
-        return Check(name, Level.FAIL, f"{found.state.value}: {found.detail}")
+    if state in {DriverState.REFUSED, DriverState.FAULT, DriverState.ESTOP}:
+        return Check(name, Level.FAIL, f"{state.value}: {found.detail}")
     if found.reported and found.reported[-1].fault_code:
-        return Check(
-            name, Level.FAIL, f"{found.state.value}: the robot reports {status_codes.fault(found.reported[-1].fault)}"
-        )
-    clock = f", clock {'synchronised' if found.clock_synchronised else 'NOT synchronised'}" if has_clock else ""
-    return Check(name, Level.OK, f"{found.identity.describe()}, {found.state.value}{clock}")
+        text = f"{state.value}: the robot reports {status_codes.fault(found.reported[-1].fault)}"
+        return Check(name, Level.FAIL, text)
+    is_synchronised = found.driver.clock_offset_ns is not None
+    clock = f", clock {'synchronised' if is_synchronised else 'NOT synchronised'}" if has_clock else ""
+    return Check(name, Level.OK, f"{identity.describe()}, {state.value}{clock}")
 
 
 def _hearing_check(found: _Found) -> Check:

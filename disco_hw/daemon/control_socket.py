@@ -53,17 +53,6 @@ class ControlMessage:
 
 
 @dataclass(slots=True)
-class ControlStats:
-    """Counters of the socket since it was opened."""
-
-    connections: int = 0
-    foreign_users: int = 0
-    evicted: int = 0
-    refused: int = 0
-    unread: int = 0
-
-
-@dataclass(slots=True)
 class _Client:
     connection: socket.socket
     last_active: int
@@ -82,7 +71,7 @@ class ControlServer:
 
     def __init__(self, path: Path, actions: Collection[str], allowed_uids: Collection[int] | None = None) -> None:
         self.path = path
-        self.stats = ControlStats()
+        self._accepted = 0
         self._actions = frozenset(actions)
         self._allowed_uids = frozenset({os.geteuid(), 0} if allowed_uids is None else allowed_uids)
         self._clients: dict[int, _Client] = {}
@@ -141,17 +130,15 @@ class ControlServer:
             except OSError:
                 return
             if peer_uid(connection) not in self._allowed_uids:
-                self.stats.foreign_users += 1
                 connection.close()
                 continue
             connection.setblocking(False)
             if len(self._clients) >= _MAX_CLIENTS:
                 # Idle connections must not keep an e-stop out.
                 self._drop(min(self._clients, key=lambda number: self._clients[number].last_active))
-                self.stats.evicted += 1
-            self.stats.connections += 1
+            self._accepted += 1
             self._activity += 1
-            self._clients[self.stats.connections] = _Client(connection, self._activity)
+            self._clients[self._accepted] = _Client(connection, self._activity)
 
     def _read(self, number: int, client: _Client) -> None:
         if client.finished:
@@ -193,7 +180,6 @@ class ControlServer:
 
     def _refuse(self, client: _Client, reason: str) -> None:
         """Say what is wrong and hang up after what is waiting: who sends garbage or floods would go on doing so."""
-        self.stats.refused += 1
         client.outgoing += msgspec.json.encode({"ok": False, "error": reason}) + b"\n"
         client.finished = True
 
@@ -209,7 +195,6 @@ class ControlServer:
             self._drop(number)
             return
         if len(client.outgoing) > _MAX_UNREAD_BYTES:
-            self.stats.unread += 1
             self._drop(number)
 
     def _drop(self, number: int) -> None:
@@ -281,9 +266,8 @@ def loop_figures(loop: LoopStats) -> dict[str, Any]:
 def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> dict[str, Any]:
     """Return everything that an operator or a page needs to know now; what does not exist is None.
 
-    `robot_state_ns`: when the newest frame with the robot's state arrived, on the monotonic clock of this host.
-
-    `loop` is from `loop_figures`.
+    `robot_state_ns`: when the newest frame with the robot's state arrived, on this host's monotonic clock. `loop` is
+    from `loop_figures`.
     """
     tick = core.last
     if tick is None:
@@ -333,7 +317,7 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
         "plausibility": asdict(core.plausibility),
         "recorder": asdict(recorder),
         "adaptation": core.adaptation.status(),
-        "area": None if core.area is None else core.area.status(tick.pipeline.t_ns),
+        "area": core.area.status(tick.pipeline.t_ns),
     }
 
 

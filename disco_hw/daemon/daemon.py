@@ -14,7 +14,7 @@ from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.process import Notifier, StopSignals, Waiting
 from disco_hw.fence.clearance import task_breach
 from disco_hw.log import records
-from disco_hw.runtime import AdviceStyle, State, advice, headline, records_of_tick
+from disco_hw.runtime import IN_USE, AdviceStyle, State, advice, headline, records_of_tick
 from disco_hw.runtime.core import CoreTick, DaemonCore, Pilot
 from disco_hw.runtime.obstacles import ObstacleRefused
 from disco_hw.runtime.robot_setup import TaskRefused, changed_task
@@ -123,7 +123,7 @@ class Daemon:
                 self._send_stop()
                 raise
             requests = ()
-            if tick.output.state not in {State.ARMED, State.STOPPING}:
+            if tick.output.state not in IN_USE:
                 return
             self._clock.sleep_until_ns(now_ns + period_ns)
         self._send_stop()
@@ -164,9 +164,9 @@ class Daemon:
             desired.motion,
             desired.by_hand,
         )
-        self._handle_messages(messages, tick.replies)
+        self._handle_messages(messages, tick.output.replies)
         self._fan = self._look_at_samples(now_ns) if tick.pipeline.plan is not None else ()
-        self._pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+        self._pilot.learn(now_ns, tick, tick.output.replies[len(requests) :])
         for text in desired.events:
             self._report("drive", text)
         for text in tick.events:
@@ -188,7 +188,7 @@ class Daemon:
             tick=stats.ticks,
             woke_ns=now_ns,
             lateness_ns=stats.last_lateness_ns,
-            stages_ns=self._loop.stages.last_ns(),
+            stages_ns=self._loop.stages.last_ns,
             overruns=stats.overruns,
             skipped=stats.skipped_periods,
         )
@@ -212,8 +212,7 @@ class Daemon:
         if now_ns < self._next_recorder_ns:
             return ()
         self._next_recorder_ns = now_ns + _RECORDER_NS
-        last = self._core.last
-        if last is None or last.output.state not in {State.ARMED, State.STOPPING}:
+        if self._core.state not in IN_USE:
             self._recorder.repair()
         self._recorder_stats = self._recorder.poll()
         self._core.recording_fault = self._recorder_stats.fault
@@ -257,18 +256,14 @@ class Daemon:
 
     def _change_area(self, now_ns: int, message: ControlMessage) -> None:
         """Add or remove an obstacle, change the fence, or let a person drive in spite of it."""
-        area, last = self._core.area, self._core.last
-        if area is None:
-            self._server.reply(message, {"ok": False, "error": "this drive has no fence guard"})
-            return
-        state = State.DISCONNECTED if last is None else last.output.state
+        area = self._core.area
         try:
             if message.action == OBSTACLE:
                 text = area.handle_request(now_ns, message.arguments)
             elif set(message.arguments) == {"override"}:
                 text = area.override(now_ns, message.arguments["override"] is True)
             else:
-                text = area.change_fence(now_ns, message.arguments, state)
+                text = area.change_fence(now_ns, message.arguments, self._core.state)
         except (ObstacleRefused, FenceRefused) as refused:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return
@@ -277,12 +272,9 @@ class Daemon:
 
     def _change_task(self, message: ControlMessage) -> None:
         """Change the task, if this state and the robot's limits allow it."""
-        last = self._core.last
-        state = State.DISCONNECTED if last is None else last.output.state
         try:
-            task = changed_task(self._core.task, message.arguments, self._core.config.robot, state)
-            area = self._core.area
-            fault = None if area is None else task_breach(area.fence, area.footprint, task.course())
+            task = changed_task(self._core.task, message.arguments, self._core.config.robot, self._core.state)
+            fault = task_breach(self._core.area.fence, self._core.area.footprint, task.course())
             if fault is not None:
                 raise TaskRefused(f"fence: {fault}; keep the task inside")
         except TaskRefused as refused:

@@ -159,20 +159,16 @@ def _settings(robot: Path, raw: dict[str, Any], file_error: str | None, option: 
     given = link_fields(option)
     if file_error is None:
         try:
-            return _link_settings(robot, raw, given), None
+            section = raw.get("link", {})
+            if not isinstance(section, dict):
+                raise InputError(f"{robot}: link: not a section; write [link] above its fields")
+            # A field that is none, misspelt or of another version, must not keep the stop from the robot.
+            return link_of(robot, {**section, **given}), None
         except InputError as error:
             file_error = str(error)
     if not names_address(given):
         raise InputError(file_error)
     return msgspec.convert(given, Link), file_error
-
-
-def _link_settings(robot: Path, raw: dict[str, Any], given: dict[str, Any]) -> Link:
-    section = raw.get("link", {})
-    if not isinstance(section, dict):
-        raise InputError(f"{robot}: link: not a section; write [link] above its fields")
-    # A field that is none, misspelt or of another version, must not keep the stop from the robot.
-    return link_of(robot, {**section, **given})
 
 
 def _socket_path(raw: dict[str, Any]) -> Path | None:

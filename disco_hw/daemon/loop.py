@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from array import array
+from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
 
@@ -20,15 +20,7 @@ class Clock(Protocol):
 
 
 class MonotonicClock:
-    """CLOCK_MONOTONIC of this host.
-
-    `spin_s` of busy waiting before each deadline buys a wake-up within microseconds for `spin_s` x rate of one CPU.
-    """
-
-    def __init__(self, spin_s: float = 0.0) -> None:
-        if not 0.0 <= spin_s <= 0.005:
-            raise ValueError(f"spin_s must be within 0 and 0.005 s, not {spin_s}")
-        self._spin_ns = round(spin_s * 1e9)
+    """CLOCK_MONOTONIC of this host."""
 
     def now_ns(self) -> int:
         """Return the present time in nanoseconds."""
@@ -36,69 +28,45 @@ class MonotonicClock:
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Return at the absolute time `deadline_ns` or later; at once if it has passed."""
-        while True:
-            remaining_ns = deadline_ns - time.monotonic_ns()
-            if remaining_ns <= 0:
-                return
-            if remaining_ns > self._spin_ns:
-                # The remaining time is taken anew each round, so a short or interrupted sleep cannot accumulate drift.
-                time.sleep((remaining_ns - self._spin_ns) * 1e-9)
+        # The remaining time is taken anew each round, so a short or interrupted sleep cannot accumulate drift.
+        while (remaining_ns := deadline_ns - time.monotonic_ns()) > 0:
+            time.sleep(remaining_ns * 1e-9)
 
 
-# As Histogram says: buckets at most 1/64 wide, up to 2^44 ns.
-_MANTISSA_BITS = 7
-_HALF = 1 << (_MANTISSA_BITS - 1)
-_LARGEST_BITS = 44
-_BUCKETS = (_LARGEST_BITS - _MANTISSA_BITS + 2) * _HALF
+# Leading binary digits that a bucket keeps, so that it is at most 1/64 wide.
+_KEPT_BITS = 7
 
 
 class Histogram:
-    """Counts of durations in nanoseconds, from 0 to 2^44 ns (4.9 hours), in buckets at most 1/64 wide (1.6 %).
+    """Counts of durations in nanoseconds, in buckets at most 1/64 wide (1.6 %).
 
     The buckets are those of a high-dynamic-range histogram: exact up to 127, then 64 to each power of two.
     """
 
     def __init__(self) -> None:
-        self._counts = array("Q", bytes(8 * _BUCKETS))
+        self._counts: Counter[int] = Counter()
         self._count = 0
         self._total_ns = 0
         self._max_ns = 0
 
-    @property
-    def count(self) -> int:
-        """Number of durations recorded."""
-        return self._count
-
-    @property
-    def max_ns(self) -> int:
-        """The longest duration, exact; 0 before the first."""
-        return self._max_ns
-
-    @property
-    def mean_ns(self) -> float:
-        """The mean duration, exact; NaN before the first."""
-        return self._total_ns / self._count if self._count else math.nan
-
     def record(self, duration_ns: int) -> None:
-        """Count one duration in its bucket; a negative one counts as 0, one beyond the range in the last bucket."""
+        """Count one duration in its bucket; a negative one counts as 0."""
         duration_ns = max(duration_ns, 0)
-        self._counts[min(_bucket(duration_ns), _BUCKETS - 1)] += 1
+        self._counts[_upper_edge_ns(duration_ns)] += 1
         self._count += 1
         self._total_ns += duration_ns
         self._max_ns = max(self._max_ns, duration_ns)
 
     def percentile_ns(self, percent: float) -> float:
         """Return the duration that `percent` of all do not exceed, at most 1.6 % too high; NaN before the first."""
-        if not self._count:
-            return math.nan
         # Rounded first: 99.9 % of 41000 is 40959, not the next integer above 40959.00000000001.
         rank = max(1, math.ceil(round(percent * self._count / 100.0, 6)))
         seen = 0
-        for bucket, count in enumerate(self._counts):
+        for upper_edge_ns, count in sorted(self._counts.items()):
             seen += count
             if seen >= rank:
-                return float(min(_upper_edge_ns(bucket), self._max_ns))
-        return float(self._max_ns)
+                return float(min(upper_edge_ns, self._max_ns))
+        return math.nan
 
     def summary_s(self) -> dict[str, float]:
         """Return p50, p99, p99.9, max and mean in seconds under the keys p50_s, p99_s, p999_s, max_s, mean_s."""
@@ -107,38 +75,32 @@ class Histogram:
             "p99_s": self.percentile_ns(99.0) * 1e-9,
             "p999_s": self.percentile_ns(99.9) * 1e-9,
             "max_s": self._max_ns * 1e-9,
-            "mean_s": self.mean_ns * 1e-9,
+            "mean_s": self._total_ns * 1e-9 / self._count if self._count else math.nan,
         }
 
 
-def _bucket(value: int) -> int:
-    shift = max(0, value.bit_length() - _MANTISSA_BITS)
-    # Beyond the exact range the leading bit is always set, so each further power of two takes half as many buckets.
-    return shift * _HALF + (value >> shift)
-
-
-def _upper_edge_ns(bucket: int) -> int:
-    shift = max(0, bucket // _HALF - 1)
-    return ((bucket - shift * _HALF + 1) << shift) - 1
+def _upper_edge_ns(duration_ns: int) -> int:
+    """Return the longest duration that is counted in the same bucket."""
+    shift = max(0, duration_ns.bit_length() - _KEPT_BITS)
+    return (((duration_ns >> shift) + 1) << shift) - 1
 
 
 class StageTimer:
     """Timer of the named parts of a tick: each lasts from the mark before it, or the tick's start, to its own.
 
-    A name that is marked more than once in a tick adds up.
+    A name that is marked more than once in a tick adds up. `last_ns`: how long each lasted in the last complete tick.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._since_ns = clock.now_ns()
         self._present_ns: dict[str, int] = {}
-        self._last_ns: dict[str, int] = {}
-        self._histograms: dict[str, Histogram] = {}
+        self.last_ns: dict[str, int] = {}
 
     def begin(self, now_ns: int) -> None:
         """Start timing a tick, whose first stage begins now."""
         self._since_ns = now_ns
-        self._present_ns.clear()
+        self._present_ns = {}
 
     def mark(self, name: str) -> None:
         """End the stage of that name here."""
@@ -147,27 +109,15 @@ class StageTimer:
         self._since_ns = now_ns
 
     def complete(self) -> None:
-        """Finish timing a tick: what was marked becomes `last_ns` and is counted."""
-        for name, duration_ns in self._present_ns.items():
-            if name not in self._histograms:
-                self._histograms[name] = Histogram()
-            self._histograms[name].record(duration_ns)
-        self._last_ns, self._present_ns = self._present_ns, self._last_ns
-
-    def last_ns(self) -> dict[str, int]:
-        """Return how long each stage of the last complete tick took."""
-        return dict(self._last_ns)
-
-    def summary_s(self) -> dict[str, dict[str, float]]:
-        """Return each stage's summary, see `Histogram.summary_s`."""
-        return {name: histogram.summary_s() for name, histogram in self._histograms.items()}
+        """Finish timing a tick: what was marked becomes `last_ns`."""
+        self.last_ns = self._present_ns
 
 
 class LoopStats:
     """Figures of the loop since it was made.
 
-    `lateness`: start of a tick after its deadline. `duration`: of the tick itself. `period`: between starts of two
-    ticks. `overruns`: ticks that ended after the next deadline. `skipped_periods`: deadlines without a tick.
+    `lateness`: start of a tick after its deadline. `duration`: of the tick itself. `overruns`: ticks that ended after
+    the next deadline. `skipped_periods`: deadlines without a tick.
     """
 
     def __init__(self) -> None:
@@ -175,21 +125,8 @@ class LoopStats:
         self.overruns = 0
         self.skipped_periods = 0
         self.last_lateness_ns = 0
-        self.last_duration_ns = 0
         self.lateness = Histogram()
         self.duration = Histogram()
-        self.period = Histogram()
-
-    def summary(self) -> dict[str, float | dict[str, float]]:
-        """Return all figures, durations in seconds."""
-        return {
-            "ticks": self.ticks,
-            "overruns": self.overruns,
-            "skipped_periods": self.skipped_periods,
-            "lateness": self.lateness.summary_s(),
-            "duration": self.duration.summary_s(),
-            "period": self.period.summary_s(),
-        }
 
 
 class Loop:
@@ -214,7 +151,6 @@ class Loop:
         """
         clock, stats, period_ns = self._clock, self.stats, self._period_ns
         deadline_ns = clock.now_ns()
-        previous_start_ns: int | None = None
         while True:
             clock.sleep_until_ns(deadline_ns)
             # Asked after the sleep, so that a request to stop that came meanwhile gets no further tick.
@@ -223,16 +159,12 @@ class Loop:
             start_ns = clock.now_ns()
             stats.last_lateness_ns = start_ns - deadline_ns
             stats.lateness.record(stats.last_lateness_ns)
-            if previous_start_ns is not None:
-                stats.period.record(start_ns - previous_start_ns)
-            previous_start_ns = start_ns
             self.stages.begin(start_ns)
             tick(start_ns)
             self.stages.complete()
             end_ns = clock.now_ns()
             stats.ticks += 1
-            stats.last_duration_ns = end_ns - start_ns
-            stats.duration.record(stats.last_duration_ns)
+            stats.duration.record(end_ns - start_ns)
             stats.overruns += end_ns > deadline_ns + period_ns
             periods = _periods_to_next(deadline_ns, start_ns, end_ns, period_ns)
             stats.skipped_periods += periods - 1

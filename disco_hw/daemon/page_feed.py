@@ -56,7 +56,8 @@ class ViewerFeed:
         self._pending: list[Record] = []
         self._plan: Plan | None = None
         self._next_ns = 0
-        self._watched = False
+        self.watched = False
+        """Whether somebody is connected."""
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
         self._socket = self._context.socket(zmq.XPUB)
         self._socket.setsockopt(zmq.SNDHWM, _QUEUED_BATCHES)
@@ -73,21 +74,16 @@ class ViewerFeed:
         finally:
             os.umask(mask)
 
-    @property
-    def watched(self) -> bool:
-        """Whether somebody is connected."""
-        return self._watched
-
     def put(self, now_ns: int, records: Sequence[Record]) -> None:
         """Take the records of one tick, and publish what has gathered if it is time."""
-        if self._watched:
+        if self.watched:
             self._gather(records)
         if now_ns < self._next_ns:
             return
         # On a grid: a period counted from this tick would grow to the next whole tick, every time.
         self._next_ns = max(self._next_ns + self._period_ns, now_ns)
         self._notice_watchers()
-        if self._watched and (self._pending or self._plan is not None):
+        if self.watched and (self._pending or self._plan is not None):
             self._publish(now_ns)
 
     def close(self) -> None:
@@ -111,7 +107,7 @@ class ViewerFeed:
         """Update whether a page watches: the socket reports when a first one subscribes and the last one leaves."""
         with contextlib.suppress(zmq.Again):
             while True:
-                self._watched = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
+                self.watched = self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
 
     def _publish(self, now_ns: int) -> None:
         batch = self._pending if self._plan is None else [*self._pending, self._plan]
@@ -127,7 +123,7 @@ class ViewerFeed:
 class WatchedRecorder:
     """A recorder whose records go to the page as well, and to who wants each tick."""
 
-    def __init__(self, recorder: Recorder, feed: ViewerFeed, ticks: ViewerFeed | None = None) -> None:
+    def __init__(self, recorder: Recorder, feed: ViewerFeed, ticks: ViewerFeed) -> None:
         self._recorder = recorder
         self._feed = feed
         self._ticks = ticks
@@ -141,13 +137,11 @@ class WatchedRecorder:
         """Record the tick, then show it."""
         self._recorder.put(now_ns, records)
         self._feed.put(now_ns, records)
-        if self._ticks is not None:
-            self._ticks.put(now_ns, records)
+        self._ticks.put(now_ns, records)
 
     def announce(self, now_ns: int, wheels: Sequence[WheelSample]) -> None:
         """Show who wants each tick the wheels of one that is yet to be planned; `put` brings them again."""
-        if self._ticks is not None:
-            self._ticks.put(now_ns, wheels)
+        self._ticks.put(now_ns, wheels)
 
     def poll(self) -> RecorderStats:
         """Return the counters of the recorder."""

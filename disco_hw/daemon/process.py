@@ -14,7 +14,6 @@ import signal
 import socket
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -35,12 +34,8 @@ class StopSignals:
 
     def __init__(self) -> None:
         self._former: dict[signal.Signals, Any] = {}
-        self._received: signal.Signals | None = None
-
-    @property
-    def received(self) -> signal.Signals | None:
+        self.received: signal.Signals | None = None
         """The first signal that came, or None."""
-        return self._received
 
     def __enter__(self) -> StopSignals:
         for number in _STOP_SIGNALS:
@@ -57,21 +52,8 @@ class StopSignals:
         self._former.clear()
 
     def _note(self, number: int, _frame: FrameType | None) -> None:
-        if self._received is None:
-            self._received = signal.Signals(number)
-
-
-@dataclass(frozen=True, slots=True)
-class StepOutcome:
-    """Outcome of one step; `error` says what failed, None if nothing did."""
-
-    name: str
-    error: str | None
-
-    @property
-    def ok(self) -> bool:
-        """Whether the step did what it should."""
-        return self.error is None
+        if self.received is None:
+            self.received = signal.Signals(number)
 
 
 class StopPath:
@@ -87,38 +69,28 @@ class StopPath:
         """Add a step, which will run before all those added so far."""
         self._steps.append((name, step))
 
-    def run(self) -> list[StepOutcome]:
-        """Run every step once and return how each ended; never raises, and a second call runs nothing."""
-        outcomes = []
+    def run(self) -> dict[str, str]:
+        """Run every step once and return what failed, by the step's name; never raises, a second call runs nothing."""
+        failed = {}
         while self._steps:
             name, step = self._steps.pop()
             try:
                 step()
             # Also SystemExit and KeyboardInterrupt: nothing may keep the steps after this one from running.
             except BaseException as error:
-                outcomes.append(StepOutcome(name, f"{type(error).__name__}: {error}"))
-            else:
-                outcomes.append(StepOutcome(name, None))
-        return outcomes
+                failed[name] = f"{type(error).__name__}: {error}"
+        return failed
 
 
 class Notifier:
-    """Sends state to the socket named by NOTIFY_SOCKET; never blocks, counts what could not be sent."""
+    """Sends state to the socket named by NOTIFY_SOCKET; never blocks."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._address = _address(environment.get("NOTIFY_SOCKET", ""))
-        self._socket: socket.socket | None = None
-        if self._address is not None:
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
-            self._socket.setblocking(False)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
         self._watchdog_ns = _watchdog_ns(environment)
         self._fed_ns: int | None = None
-        self._unsent = 0
-
-    @property
-    def unsent(self) -> int:
-        """Number of messages that the service manager did not take."""
-        return self._unsent
 
     def ready(self) -> None:
         """Say that the daemon serves; the service manager's watchdog runs from here."""
@@ -140,19 +112,11 @@ class Notifier:
         """Say that the daemon is stopping."""
         self._send("STOPPING=1")
 
-    def close(self) -> None:
-        """Release the socket of the service manager; safe to call twice. What is sent afterwards goes nowhere."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
-
     def _send(self, message: str) -> None:
-        if self._socket is None or self._address is None:
-            return
-        try:
-            self._socket.sendto(message.encode(), self._address)
-        except OSError:
-            self._unsent += 1
+        if self._address is not None:
+            # A manager that has gone or does not read is no reason to stop driving.
+            with contextlib.suppress(OSError):
+                self._socket.sendto(message.encode(), self._address)
 
 
 def _address(name: str) -> str | bytes | None:
@@ -173,7 +137,7 @@ def _watchdog_ns(environment: Mapping[str, str]) -> int | None:
 
 
 # File descriptors (POSIX).
-STANDARD_OUTPUT, STANDARD_ERROR = 1, 2
+STANDARD_INPUT, STANDARD_OUTPUT, STANDARD_ERROR = 0, 1, 2
 # Chosen: lines for a terminal that has stopped reading; further ones are dropped and counted.
 _MOST_LINES = 1000
 

@@ -27,7 +27,7 @@ from numba.core import event
 from disco_hw import processes
 from disco_hw.adaptation.guard import AdaptationChoice, check_adaptable, choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Report
@@ -46,14 +46,14 @@ from disco_hw.runtime.assembly import (
     create_fast_adaptation,
     create_link,
     create_pipeline,
-    create_planner,
     driver_of,
+    planner_of,
 )
 from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Standstill
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from drivers.kernel_cache import are_kernels_kept
-from drivers.types import PoseSample, Readings, Transport, WheelSample
+from drivers.types import PoseSample, Readings, WheelSample
 from firmware_protocol.codec import packaged_dbc
 
 
@@ -120,15 +120,11 @@ def run_daemon(
             options.log_file,
             report,
             create_pilot(setup.config),
-            lambda: create_planner(setup.config, setup.model) if law is None else _controller(law, setup),
+            lambda: planner_of(setup, law),
             chosen.kind == "fast",
             by_command(options.robot),
             page_messages,
         )
-
-
-def _controller(law: Law, setup: Setup) -> LawController:
-    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))
 
 
 def serve(
@@ -148,88 +144,56 @@ def serve(
     while driving; not where an operator drives. `advice_style`: how the operator requests the next step; with it
     the daemon reports what it waits for, what to do, and where the log is. Raises InputError.
     """
-    key, transport = link_key(setup), create_link(setup)
+    config, key, transport = setup.config, link_key(setup), create_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
     planner = compiled_elsewhere(lambda: warm_planner(setup, new_planner), describe_planner(setup), _progress)
-    pipeline = create_pipeline(setup.config, setup.model, planner)
+    pipeline = create_pipeline(config, setup.model, planner)
     stop = StopPath()
     with StopSignals() as signals:
         try:
-            code = _start(
-                setup,
-                key,
-                transport,
-                pipeline,
-                log_file,
-                signals,
-                stop,
-                report,
-                pilot,
-                adapts,
-                advice_style,
-                page_messages,
-            ).run()
+            # In the order that real time needs. The planner is compiled: whoever finds the socket gets an answer.
+            server = ControlServer(socket_path(config), SERVED)
+            stop.add("control socket", server.close)
+            feed = ViewerFeed(feed_path(server.path))
+            stop.add("page feed", feed.close)
+            ticks = ViewerFeed(tick_feed_path(server.path), period_s=0.0)
+            stop.add("tick feed", ticks.close)
+            log = log_file or (new_log(config) if config.log.enabled else None)
+            recorder = WatchedRecorder(_create_recorder(setup, log), feed, ticks)
+            if advice_style is not None and log is not None:
+                stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
+            stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
+            adaptation = create_fast_adaptation(setup, pipeline) if adapts else None
+            for step in processes.enter_real_time(config.daemon.realtime_priority):
+                report("real time", str(step))
+            for line in passed_over(server.path):
+                report("control socket", line)
+            transport.open()
+            stop.add("link", transport.close)
+            driver = driver_of(config, key)
+            core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
+            core.announce = recorder.announce
+            stop.add("pose source", core.pose_source.close)
+            if core.obstacle_source is not None:
+                stop.add("obstacle source", core.obstacle_source.close)
+            if isinstance(pilot, FindsWiring):
+                core.directions = None
+            clock = MonotonicClock()
+            daemon = Daemon(core, server, recorder, clock, signals, report, pilot, advice_style, page_messages)
+            stop.add("wheels", daemon.stop_wheels)
+            if config.daemon.realtime_priority:
+                report("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))
+            report("daemon", f"{transport.name}, control socket {server.path}")
+            if advice_style is not None:
+                report("log", "nothing is recorded, as log.enabled is false" if log is None else f"recording to {log}")
+                report("next", f"when the state is READY, {advice_style('arm')}, then {advice_style('start')}")
+            code = daemon.run()
         finally:
             # Whatever is interrupted here, the wheels come first: they were added last.
-            outcomes = stop.run()
-            for outcome in outcomes:
-                if not outcome.ok:
-                    report("stop", f"{outcome.name}: {outcome.error}")
-        return code or int(any(outcome.name == _RECORDER and not outcome.ok for outcome in outcomes))
-
-
-def _start(
-    setup: Setup,
-    key: bytes | None,
-    transport: Transport,
-    pipeline: Pipeline,
-    log_file: Path | None,
-    signals: StopSignals,
-    stop: StopPath,
-    report: Report,
-    pilot: Pilot,
-    adapts: bool,
-    advice_style: AdviceStyle | None,
-    page_messages: Callable[[], tuple[str, ...]],
-) -> Daemon:
-    """Make everything, in the order that real time needs, and add to the stop path what must be undone."""
-    config = setup.config
-    # The planner was compiled before: whoever finds the socket gets an answer.
-    server = ControlServer(socket_path(config), SERVED)
-    stop.add("control socket", server.close)
-    feed = ViewerFeed(feed_path(server.path))
-    stop.add("page feed", feed.close)
-    ticks = ViewerFeed(tick_feed_path(server.path), period_s=0.0)
-    stop.add("tick feed", ticks.close)
-    log = _log_path(config, log_file)
-    recorder = WatchedRecorder(_create_recorder(setup, log), feed, ticks)
-    if advice_style is not None and log is not None:
-        stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
-    stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
-    adaptation = create_fast_adaptation(setup, pipeline) if adapts else None
-    for step in processes.enter_real_time(config.daemon.realtime_priority):
-        report("real time", str(step))
-    for line in passed_over(server.path):
-        report("control socket", line)
-    transport.open()
-    stop.add("link", transport.close)
-    driver = driver_of(config, key)
-    core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
-    core.announce = recorder.announce
-    stop.add("pose source", core.pose_source.close)
-    if core.obstacle_source is not None:
-        stop.add("obstacle source", core.obstacle_source.close)
-    if isinstance(pilot, FindsWiring):
-        core.directions = None
-    daemon = Daemon(core, server, recorder, MonotonicClock(), signals, report, pilot, advice_style, page_messages)
-    stop.add("wheels", daemon.stop_wheels)
-    if config.daemon.realtime_priority:
-        report("real time", str(processes.raise_loop_thread(config.daemon.realtime_priority)))
-    report("daemon", f"{transport.name}, control socket {server.path}")
-    if advice_style is not None:
-        report("log", f"recording to {log}" if log is not None else "nothing is recorded, as log.enabled is false")
-        report("next", f"when the state is READY, {advice_style('arm')}, then {advice_style('start')}")
-    return daemon
+            failed = stop.run()
+            for name, error in failed.items():
+                report("stop", f"{name}: {error}")
+        return code or int(_RECORDER in failed)
 
 
 def _progress(text: str) -> None:
@@ -238,12 +202,10 @@ def _progress(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def _log_path(config: RobotConfig, log_file: Path | None) -> Path | None:
-    """Return the path of the log; None if nothing is recorded."""
-    if log_file is not None or not config.log.enabled:
-        return log_file
+def new_log(config: RobotConfig, what: str = "") -> Path:
+    """Return the path of a new log: the directory of [log], the name of the robot, what is recorded, the time (UTC)."""
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{stamp}.mcap"
+    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{what}{stamp}.mcap"
 
 
 def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
@@ -399,7 +361,7 @@ def compile_beforehand(robot: Path, model: Path | None, report: Callable[[str], 
     except InputError:
         return
     with compile_progress(describe_planner(setup), report):
-        warm_planner(setup, lambda: create_planner(setup.config, setup.model))
+        warm_planner(setup, lambda: planner_of(setup, None))
 
 
 def describe_planner(setup: Setup) -> str:

@@ -191,17 +191,12 @@ class PageSource:
     completed, task = True, ""
 
     def __init__(self, top_rad_s: float, turn_share: float, status_text: str = PAD_STATUS_TEXT) -> None:
-        self._status_text = status_text
+        self.status_text = status_text
         self._top_rad_s = top_rad_s
         self._turn_share = turn_share
         self._open_ns: dict[int, int] = {}
         self._holder: int | None = None
         self._newest: ManualInput | None = None
-
-    @property
-    def status_text(self) -> str:
-        """Text for the operator on what to hold, and where."""
-        return self._status_text
 
     def steer(self, now_ns: int, page: int, steering: Steering) -> str | None:
         """Take in what one page wants; return why it is refused, in words, or None if it is accepted."""

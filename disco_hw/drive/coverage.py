@@ -6,7 +6,7 @@ speeds, backwards, starts and stops, steering, slow ramps through zero, rests.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 # Chosen: shares of the top speed, below which a robot stands, above which it moves and is fast; between the first two
@@ -49,26 +49,24 @@ class Item:
         return f"{self.name} {min(self.found, self.target):.0f}/{self.target:.0f}{unit}"
 
 
-_SECONDS = (
-    ("straight slow", "wheel radius", 3.0),
-    ("straight fast", "wheel radius apart from what grows with speed", 2.0),
-    ("reverse slow", "offsets that change sign with the direction", 3.0),
-    ("reverse fast", "offsets apart from what grows with speed", 2.0),
-    ("turn left slow", "axial distance", 3.0),
-    ("turn left fast", "axial distance apart from slip in turns", 2.0),
-    ("turn right slow", "left apart from right", 3.0),
-    ("turn right fast", "left apart from right, slip in turns", 2.0),
-    ("curve left slow", "x_icr", 3.0),
-    ("curve left fast", "x_icr apart from side slip", 3.0),
-    ("curve right slow", "pose latency apart from a heading bias", 3.0),
-    ("curve right fast", "pose latency apart from a heading bias", 3.0),
-    ("rest", "noise of the poses", 5.0),
-)
-_TIMES = (
-    ("hard start", "lag and delay, slip under acceleration", 6.0),
-    ("hard stop", "lag and delay, slip under braking", 6.0),
-    ("quick steering", "delay apart from lag", 6.0),
-    ("slow crossing of zero", "deadband apart from stiction", 2.0),
+_ITEMS = (
+    Item("straight slow", "wheel radius", "s", 3.0),
+    Item("straight fast", "wheel radius apart from what grows with speed", "s", 2.0),
+    Item("reverse slow", "offsets that change sign with the direction", "s", 3.0),
+    Item("reverse fast", "offsets apart from what grows with speed", "s", 2.0),
+    Item("turn left slow", "axial distance", "s", 3.0),
+    Item("turn left fast", "axial distance apart from slip in turns", "s", 2.0),
+    Item("turn right slow", "left apart from right", "s", 3.0),
+    Item("turn right fast", "left apart from right, slip in turns", "s", 2.0),
+    Item("curve left slow", "x_icr", "s", 3.0),
+    Item("curve left fast", "x_icr apart from side slip", "s", 3.0),
+    Item("curve right slow", "pose latency apart from a heading bias", "s", 3.0),
+    Item("curve right fast", "pose latency apart from a heading bias", "s", 3.0),
+    Item("rest", "noise of the poses", "s", 5.0),
+    Item("hard start", "lag and delay, slip under acceleration", "times", 6.0),
+    Item("hard stop", "lag and delay, slip under braking", "times", 6.0),
+    Item("quick steering", "delay apart from lag", "times", 6.0),
+    Item("slow crossing of zero", "deadband apart from stiction", "times", 2.0),
 )
 
 
@@ -81,7 +79,7 @@ class Coverage:
 
     def __init__(self, top_rad_s: float) -> None:
         self._top_rad_s = top_rad_s
-        self._found: dict[str, float] = dict.fromkeys([name for name, *_ in (*_SECONDS, *_TIMES)], 0.0)
+        self._found: dict[str, float] = dict.fromkeys([item.name for item in _ITEMS], 0.0)
         self._t_ns: int | None = None
         self._stationary_ns: int | None = None
         self._fast_ns: int | None = None
@@ -117,9 +115,7 @@ class Coverage:
 
     def items(self) -> tuple[Item, ...]:
         """Return everything that counts, covered or not."""
-        seconds = (Item(name, purpose, "s", target, self._found[name]) for name, purpose, target in _SECONDS)
-        times = (Item(name, purpose, "times", target, self._found[name]) for name, purpose, target in _TIMES)
-        return (*seconds, *times)
+        return tuple(replace(item, found=self._found[item.name]) for item in _ITEMS)
 
     def missing(self) -> tuple[Item, ...]:
         """Return the items of which too little has been driven."""

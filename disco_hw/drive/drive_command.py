@@ -9,35 +9,33 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from disco_hw.config import Link, RobotConfig
 from disco_hw.daemon import socket_path
 from disco_hw.daemon.loop import MonotonicClock
-from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_OUTPUT, AsyncPrinter
-from disco_hw.daemon.run import in_text, serve
+from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_INPUT, STANDARD_OUTPUT, AsyncPrinter
+from disco_hw.daemon.run import in_text, new_log, serve
 from disco_hw.drive import PAD_STATUS_TEXT, GamepadSource, ManualSource, PageSource
 from disco_hw.drive.coverage import Coverage
-from disco_hw.drive.fit import FittedScriptSource, ScriptGeometry
+from disco_hw.drive.fit import FittedScriptSource
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import create_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
 from disco_hw.fence.clearance import Boundaries
-from disco_hw.files import check_log_file, file_name_of
+from disco_hw.files import check_log_file
 from disco_hw.log.reader import open_log
-from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
+from disco_hw.runtime.assembly import odometry_parameters
+from disco_hw.runtime.robot_setup import Setup, load_setup
 from drivers.gamepad import Gamepad, GamepadError, GamepadMapping, open_gamepad
 
 _VIRTUAL_INTERFACES = ("unixcan", "virtual")
 _PSEUDO_TERMINALS = "/dev/pts/"
 # Chosen: longer than the display's process takes to end by itself; then it is killed.
 _DISPLAY_TIMEOUT_S = 2.0
-# File descriptor (POSIX).
-_STANDARD_INPUT = 0
 
 
 def leads_to_virtual_robot(link: Link) -> bool:
@@ -102,7 +100,7 @@ def run_drive(options: DriveOptions, page_messages: Callable[[], tuple[str, ...]
     setup = load_setup(options.robot, options.model, options.link)
     config = setup.config
     script = _script(options, config)
-    log_file = options.log_file or _new_log(config)
+    log_file = options.log_file or new_log(config, "drive-")
     top_rad_s = config.drive.speed_share * config.robot.max_wheel_speed_rad_s
     prompt = "cmd_vel: arm through the bridge, then it drives; Ctrl-C ends" if options.ros2 else PAD_STATUS_TEXT
     page = PageSource(top_rad_s, config.drive.turn_share, prompt) if options.page or options.ros2 else None
@@ -179,9 +177,11 @@ def _source(
         raise InputError(f"{' and '.join(chosen)}: only one deadman can be used; leave one of them out")
     source: ManualSource
     if options.unattended:
-        if not leads_to_virtual_robot(config.link):
+        link = config.link
+        if not leads_to_virtual_robot(link):
+            named = f"port {link.port}" if link.kind == "serial" else f"interface {link.interface} {link.channel}"
             raise InputError(
-                f"--unattended: {_option(config.link)} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
+                f"--unattended: link.{named} may lead to a real robot; hold a deadman (keyboard, --gamepad, "
                 "--page, --ros2), or start the virtual robot first"
             )
         source = Unattended()
@@ -190,18 +190,14 @@ def _source(
     elif options.gamepad:
         source = _gamepad(config, top_rad_s)
     else:
-        source = Keyboard(_STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
+        source = Keyboard(STANDARD_INPUT, KeyHold(top_rad_s), MonotonicClock())
     if script is None:
         return source
     if not config.fence.is_set:
         return ScriptSource(script, source)
-    robot = ScriptGeometry(*geometry(setup.model)[0])
+    robot = odometry_parameters(setup.model)
     room = room_needed(script.at, script.duration_s, config.robot)
     return FittedScriptSource(script, source, robot, Boundaries(config.robot.footprint, config.fence), room)
-
-
-def _option(link: Link) -> str:
-    return f"link.port {link.port}" if link.kind == "serial" else f"link.interface {link.interface} {link.channel}"
 
 
 def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
@@ -221,11 +217,6 @@ def _gamepad(config: RobotConfig, top_rad_s: float) -> GamepadSource:
     except GamepadError as error:
         raise InputError(f"--gamepad: {error}") from None
     return GamepadSource(pad, open_pad, top_rad_s, settings.turn_share, settings.gamepad_silence_s)
-
-
-def _new_log(config: RobotConfig) -> Path:
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-drive-{stamp}.mcap"
 
 
 @contextmanager

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.drive import ManualInput, ManualSource, RobotView
 from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource, Wheels
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence.clearance import Boundaries
 
 Array = NDArray[np.float64]
@@ -31,25 +32,16 @@ _STEP_S = 0.05
 _VARIANTS = (("", 1.0, False), ("mirrored", 1.0, True), ("backward", -1.0, False), ("mirrored, backward", -1.0, True))
 
 
-@dataclass(frozen=True, slots=True)
-class ScriptGeometry:
-    """The robot that a script is fitted for (m): that of its model."""
-
-    wheel_radius_m: float
-    axial_distance_m: float
-    x_icr_m: float
-
-
 class ScriptDoesNotFit(Exception):  # noqa: N818
     """No order and no speed brings the script into the fence; the message says how much room it needs."""
 
 
 def fit_script(
-    script: Script, start: Pose, robot: ScriptGeometry, bounds: Boundaries, room: Room
+    script: Script, start: Pose, robot: OdometryParameters, bounds: Boundaries, room: Room
 ) -> Iterator[Script | None]:
     """Yield None while it works, and at last a script that stays inside from this pose. Raises ScriptDoesNotFit.
 
-    `room`: what the script takes as it is, for the message.
+    `robot`: the geometry of its model. `room`: what the script takes as it is, for the message.
     """
     keep_m = bounds.fence.margin_m + SPARE_M
     # All at one speed, the largest that there is; else each as fast as it can be.
@@ -75,7 +67,7 @@ def fit_script(
 
 
 def _next_that_fits(
-    remaining: list[Manoeuvre], scale: float, pose: Pose, robot: ScriptGeometry, bounds: Boundaries, keep_m: float
+    remaining: list[Manoeuvre], scale: float, pose: Pose, robot: OdometryParameters, bounds: Boundaries, keep_m: float
 ) -> tuple[int, Manoeuvre, Pose] | None:
     """Return the first of the next manoeuvres that stays inside in some variant, and where it ends."""
     finds_limits = any(one.finds_limits for one in remaining)
@@ -113,7 +105,7 @@ def _changed(manoeuvre: Manoeuvre, scale: float, description: str, sign: float, 
     return replace(manoeuvre, wheels=wheels, purpose=f"{manoeuvre.purpose} ({note})")
 
 
-def driven_path(manoeuvre: Manoeuvre, start: Pose, robot: ScriptGeometry) -> Array:
+def driven_path(manoeuvre: Manoeuvre, start: Pose, robot: OdometryParameters) -> Array:
     """Poses (N, 3) of the tracked point over a manoeuvre, of a robot that does what it is told."""
     count = max(1, math.ceil(manoeuvre.duration_s / _STEP_S))
     step_s = manoeuvre.duration_s / count
@@ -131,7 +123,7 @@ class FittedScriptSource:
     """Plays a script, fitted into the fence from where the robot stands, while another source's deadman is held."""
 
     def __init__(
-        self, script: Script, deadman: ManualSource, robot: ScriptGeometry, bounds: Boundaries, room: Room
+        self, script: Script, deadman: ManualSource, robot: OdometryParameters, bounds: Boundaries, room: Room
     ) -> None:
         self._script, self._deadman = script, deadman
         self._robot, self._bounds, self._room = robot, bounds, room

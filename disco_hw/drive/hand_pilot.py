@@ -10,7 +10,7 @@ from typing import Any
 from disco_hw.config import RobotConfig
 from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, ManualSource, PageSource, RobotView, steering_from
 from disco_hw.drive.coverage import Coverage
-from disco_hw.runtime import State
+from disco_hw.runtime import IN_USE, State
 from disco_hw.runtime.core import CoreTick, Pilot, PilotTick, TaskPilot
 from disco_hw.runtime.fence_guard import STOPS_MOTION
 from disco_hw.runtime.pipeline import Manual, Source, Standstill
@@ -39,11 +39,6 @@ class Deadman:
         self._engaged = False
         self._was_armed = False
         self._release_requested = False
-
-    @property
-    def engaged(self) -> bool:
-        """Whether the press that began this stretch of driving still holds."""
-        return self._engaged
 
     def step(self, now_ns: int, newest: ManualInput | None, state: State) -> DeadmanVerdict:
         """Judge the newest input (None: the device is gone) in the daemon's present state."""
@@ -106,6 +101,9 @@ _MESSAGES = 5
 class HandPilot:
     """Drives as its source says, while its deadman is held."""
 
+    # The person sees the robot.
+    needs_pose = False
+
     def __init__(self, source: ManualSource, coverage: Coverage, page: PageSource | None = None) -> None:
         """`page` is what hears the page: the source itself, or the deadman of its script."""
         self._source = source
@@ -118,21 +116,15 @@ class HandPilot:
         self._messages: deque[str] = deque(maxlen=_MESSAGES)
 
     @property
-    def needs_pose(self) -> bool:
-        """The person sees the robot."""
-        return False
-
-    @property
     def done(self) -> bool:
         """Whether the source has ended."""
         return self._source.ended is not None
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Poll the source once and judge what it says."""
-        state = State.DISCONNECTED if last is None else last.output.state
-        view = RobotView(state, self._driving, _measured(last), _pose(last), _is_held(last))
+        view = _view(last, self._driving)
         newest = self._source.poll(now_ns, view)
-        verdict = self._deadman.step(now_ns, newest, state)
+        verdict = self._deadman.step(now_ns, newest, view.state)
         if self._source.ended is not None:
             self._pending_messages.append(self._source.ended)
         elif verdict.event is not None:
@@ -182,24 +174,17 @@ class HandPilot:
         }
 
 
-def _measured(last: CoreTick | None) -> tuple[float, float] | None:
-    if last is None or not last.pipeline.estimate.wheels_ok:
-        return None
-    return last.pipeline.estimate.left_speed_rad_s, last.pipeline.estimate.right_speed_rad_s
-
-
-def _pose(last: CoreTick | None) -> tuple[float, float, float] | None:
-    if last is None or not last.pipeline.estimate.ok:
-        return None
+def _view(last: CoreTick | None, driving: bool) -> RobotView:
+    if last is None:
+        return RobotView(State.DISCONNECTED, driving)
     estimate = last.pipeline.estimate
-    return estimate.x_m, estimate.y_m, estimate.yaw_rad
-
-
-def _is_held(last: CoreTick | None) -> bool:
-    return last is not None and last.pipeline.fence.verdict in STOPS_MOTION
-
-
-_IN_USE = frozenset({State.ARMED, State.STOPPING})
+    return RobotView(
+        last.output.state,
+        driving,
+        (estimate.left_speed_rad_s, estimate.right_speed_rad_s) if estimate.wheels_ok else None,
+        (estimate.x_m, estimate.y_m, estimate.yaw_rad) if estimate.ok else None,
+        last.pipeline.fence.verdict in STOPS_MOTION,
+    )
 
 
 class UntilHeading:
@@ -226,7 +211,7 @@ class UntilHeading:
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Choose whose turn it is and ask that one."""
-        if last is not None and last.output.state not in _IN_USE:
+        if last is not None and last.output.state not in IN_USE:
             estimate = last.pipeline.estimate
             missing = estimate.initialised and not estimate.heading_known
             self._now = self._by_hand if missing else self._task

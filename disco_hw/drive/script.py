@@ -157,12 +157,7 @@ class Pieces:
 
     def each(self, purpose: str, *state: tuple[str, float, float, float]) -> list[Manoeuvre]:
         """Several held ones (name, duration, forward, turn), each followed by a rest."""
-        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), self.rest())]
-
-    @staticmethod
-    def rest(duration_s: float = REST_S) -> Manoeuvre:
-        """Create a manoeuvre that stands still."""
-        return rest(duration_s)
+        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), rest())]
 
 
 # Five periods at 50 Hz: after a longer pause of the loop the script goes on from where it was.
@@ -185,7 +180,8 @@ class ScriptSource:
         self._last_ns: int | None = None
         self._driven = False
         self._driving = False
-        self._over = False
+        self.completed = False
+        """Whether the script was played to its end."""
         self._fenced = ""
         self._limits = ReachedLimits()
 
@@ -197,12 +193,7 @@ class ScriptSource:
                 f"the fence stopped the script {self._script.name} in {self._fenced}; the event before this one "
                 "says where"
             )
-        return f"script {self._script.name} completed" if self._over else self._deadman.ended
-
-    @property
-    def completed(self) -> bool:
-        """Whether the script was played to its end."""
-        return self._over
+        return f"script {self._script.name} completed" if self.completed else self._deadman.ended
 
     @property
     def status_text(self) -> str:
@@ -244,7 +235,7 @@ class ScriptSource:
         self._advance(now_ns, robot)
         if state is None:
             return None
-        if self._over or self._fenced:
+        if self.completed or self._fenced:
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         left, right = self._wheels()
         return ManualInput(state.t_ns, left, right, state.deadman)
@@ -280,10 +271,10 @@ class ScriptSource:
         if robot.driving and self._last_ns is not None:
             # A loop held up must not skip what was to be driven meanwhile.
             self._driven_ns += min(now_ns - self._last_ns, _LONGEST_TICK_NS)
-            self._over = self._over or self._manoeuvre is None
+            self.completed = self.completed or self._manoeuvre is None
             self._driven = True
             self._observe(robot.wheels)
-        elif self._driven and robot.state is not State.ARMED and not self._over:
+        elif self._driven and robot.state is not State.ARMED and not self.completed:
             place = self._script.place(self._driven_ns * 1e-9)
             self._driven_ns = 0 if place is None else round(place[1] * 1e9)
             self._driven = False
@@ -295,8 +286,10 @@ class Unattended:
     """Holds the deadman by itself, once: for the virtual robot, and for tests.
 
     Pressed when the robot has become ready; if it does not drive within `driving_within_s`, then or after a hold while
-    armed, or is disarmed by anybody, it is released for good.
+    armed, or is disarmed by anybody, it is released for good. So it never ends as it should.
     """
+
+    completed, task = False, ""
 
     def __init__(self, ready_within_s: float = 60.0, driving_within_s: float = 5.0) -> None:
         self._ready_within_ns = round(ready_within_s * 1e9)
@@ -305,49 +298,35 @@ class Unattended:
         self._pressed_ns: int | None = None
         self._waiting_ns = 0
         self._driven = False
-        self._ended: str | None = None
-
-    @property
-    def ended(self) -> str | None:
+        self.ended: str | None = None
         """Reason why the deadman was released; None while it was not."""
-        return self._ended
-
-    @property
-    def completed(self) -> bool:
-        """Always False, because it never ends by itself as it should."""
-        return False
 
     @property
     def status_text(self) -> str:
         """Text for the operator on what it waits for."""
         return "unattended: waiting for the robot" if self._pressed_ns is None else "unattended: deadman held"
 
-    @property
-    def task(self) -> str:
-        """Holding the deadman is all it does."""
-        return ""
-
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
         """Return the deadman's state, with wheel speeds of zero."""
         if self._first_ns is None:
             self._first_ns = now_ns
-        state = self._pressed_ns is not None and self._ended is None
+        state = self._pressed_ns is not None and self.ended is None
         if self._pressed_ns is None:
             if robot.state is State.READY:
                 # Held from the next tick on: a deadman counts only after it was seen open.
                 self._pressed_ns = self._waiting_ns = now_ns
             elif now_ns - self._first_ns > self._ready_within_ns:
-                self._ended = (
+                self.ended = (
                     f"the robot was not ready within {self._ready_within_ns * 1e-9:g} s; `disco-hw ctl ROBOT.toml "
                     "status` says why"
                 )
         elif robot.driving:
             self._driven, self._waiting_ns = True, now_ns
         elif self._driven and robot.state is not State.ARMED:
-            self._ended = self._ended or "the robot was disarmed before the script was over"
+            self.ended = self.ended or "the robot was disarmed before the script was over"
         elif now_ns - self._waiting_ns > self._driving_within_ns:
             hold = f"the robot stood still for {self._driving_within_ns * 1e-9:g} s before the script was over"
-            self._ended = self._ended or (hold if self._driven else "the robot did not start to drive")
+            self.ended = self.ended or (hold if self._driven else "the robot did not start to drive")
         return ManualInput(now_ns, 0.0, 0.0, deadman=state)
 
     def close(self) -> None:

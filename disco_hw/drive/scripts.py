@@ -60,23 +60,23 @@ def _starts(pieces: Pieces, count: int) -> list[Manoeuvre]:
     found: list[Manoeuvre] = []
     for number in range(count):
         forward = (1.0, -1.0, 0.5, -0.5)[number % 4]
-        found += [pieces.hold(f"start and stop {number + 1}", _START, 0.8, forward, 0.0), pieces.rest()]
+        found += [pieces.hold(f"start and stop {number + 1}", _START, 0.8, forward, 0.0), rest()]
     return found
 
 
 def _steering(pieces: Pieces, duration_s: float) -> list[Manoeuvre]:
     steer = pieces.play("steering", _STEER, duration_s, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s)))
-    return [steer, pieces.rest()]
+    return [steer, rest()]
 
 
 def _ramps(pieces: Pieces, duration_s: float) -> list[Manoeuvre]:
     def wave(t_s: float) -> float:
-        return 0.25 * 2.0 / math.pi * math.asin(math.sin(2.0 * math.pi * t_s / duration_s))
+        """Return a triangle of height 0.25, which begins and ends at zero."""
+        return 0.25 * (2.0 / math.pi * math.asin(math.sin(2.0 * math.pi * (t_s / duration_s))))
 
     return [
         pieces.play("ramp through zero", _RAMP, duration_s, lambda t_s: (wave(t_s), 0.0)),
         pieces.play("turning ramp through zero", _RAMP, duration_s, lambda t_s: (0.0, wave(t_s))),
-        pieces.rest(),
     ]
 
 
@@ -86,7 +86,7 @@ def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
         "spins": 2 * (_slow_spins(pieces, 4.0) + _fast_spins(pieces, 3.0)),
         "curves": 2 * _curves(pieces, 4.0, 3.0),
         "starts": _starts(pieces, 12) + _steering(pieces, 10.0),
-        "ramps": 2 * _ramps(pieces, 8.0),
+        "ramps": 2 * [*_ramps(pieces, 8.0), rest()],
         # Turns and straights at either end, for what changes on the way.
         "separate": [
             *_slow_straights(pieces, 2.0),
@@ -95,6 +95,7 @@ def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
             *_starts(pieces, 6),
             *_steering(pieces, 4.0),
             *_ramps(pieces, 5.0),
+            rest(),
             *_slow_spins(pieces, 2.0),
             *_fast_spins(pieces, 1.5),
             *_fast_straights(pieces, 2.0),
@@ -118,7 +119,7 @@ SEPARATING = tuple(PURPOSES)
 def separating(name: str, top_rad_s: float) -> Script:
     """Return the script of that name with wheel speeds up to `top_rad_s`, from rest to rest; raises KeyError."""
     pieces = Pieces(top_rad_s)
-    return Script(name, (pieces.rest(1.0), *_built(pieces)[name], pieces.rest(1.0)))
+    return Script(name, (rest(1.0), *_built(pieces)[name], rest(1.0)))
 
 
 SCRIPTS = ("circle", "steps", "excite", *SEPARATING)
@@ -237,8 +238,7 @@ def excite(top_rad_s: float) -> Script:
     found += [
         pieces.play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
         rest(),
-        pieces.play("ramp through zero", _RAMP, 10.0, lambda t_s: (0.25 * _triangle(t_s / 10.0), 0.0)),
-        pieces.play("turning ramp through zero", _RAMP, 10.0, lambda t_s: (0.0, 0.25 * _triangle(t_s / 10.0))),
+        *_ramps(pieces, 10.0),
         rest(2.0, "noise of the poses at standstill, elsewhere"),
     ]
     return Script("excite", tuple(found))
@@ -246,8 +246,3 @@ def excite(top_rad_s: float) -> Script:
 
 def _constant(left_rad_s: float, right_rad_s: float) -> Callable[[float], tuple[float, float]]:
     return lambda _t_s: (left_rad_s, right_rad_s)
-
-
-def _triangle(share: float) -> float:
-    """0, 1, 0, -1, 0 at shares 0, 1/4, 1/2, 3/4, 1 of the period, straight in between."""
-    return 2.0 / math.pi * math.asin(math.sin(2.0 * math.pi * share))

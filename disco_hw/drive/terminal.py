@@ -21,7 +21,6 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -79,14 +78,6 @@ class _Hold(enum.Enum):
     LAPSED = "lapsed"
 
 
-@dataclass(frozen=True, slots=True)
-class KeyEvent:
-    """The newest key of those that came together, and when."""
-
-    t_ns: int
-    key: bytes
-
-
 class KeyHold:
     """Turns key events into wheel speeds and a deadman.
 
@@ -115,17 +106,17 @@ class KeyHold:
         lapsed = "; release all keys for half a second" if self._state is _Hold.LAPSED else ""
         return f"keyboard, {self._share:.0%} speed{lapsed}"
 
-    def press(self, event: KeyEvent) -> None:
-        """Take in a key."""
-        if event.key in DIRECTIONS:
-            self._state = self._after(event.t_ns)
-            self._direction = DIRECTIONS[event.key]
+    def press(self, t_ns: int, key: bytes) -> None:
+        """Take in the newest key of those that came together."""
+        if key in DIRECTIONS:
+            self._state = self._after(t_ns)
+            self._direction = DIRECTIONS[key]
         else:
             self._state = _Hold.LAPSED
-            if event.key in _DIGITS:
-                self._share = int(event.key) / 9.0
-        self._ignored = self._ignored + 1 if self._state is _Hold.LAPSED and event.key in DIRECTIONS else 0
-        self._last_ns = event.t_ns
+            if key in _DIGITS:
+                self._share = int(key) / 9.0
+        self._ignored = self._ignored + 1 if self._state is _Hold.LAPSED and key in DIRECTIONS else 0
+        self._last_ns = t_ns
 
     def at(self, now_ns: int) -> ManualInput:
         """Return the wheel speeds and the deadman at a time."""
@@ -175,12 +166,16 @@ class Keyboard:
     the source. To be made before the process takes on real time, so that its thread does not.
     """
 
+    # The operator decides.
+    task = ""
+
     def __init__(self, descriptor: int, hold: KeyHold, clock: Clock) -> None:
         self._descriptor = descriptor
         self._hold = hold
         self._clock = clock
         self._arrived: deque[tuple[int, bytes]] = deque()
-        self._ended: str | None = None
+        self.ended: str | None = None
+        """Reason why there will be no further input: Ctrl-D, or the terminal has closed."""
         self._gone = False
         self._typed = ""
         try:
@@ -202,11 +197,6 @@ class Keyboard:
         self._reader.start()
 
     @property
-    def ended(self) -> str | None:
-        """Reason why there will be no further input: Ctrl-D, or the terminal has closed."""
-        return self._ended
-
-    @property
     def completed(self) -> bool:
         """Whether the terminal is still there: a person drives for as long as they like."""
         return not self._gone
@@ -221,18 +211,13 @@ class Keyboard:
         """Whether a key is held that does not count before all keys were released for half a second."""
         return self._hold.is_ignored
 
-    @property
-    def task(self) -> str:
-        """Always empty, because the operator decides."""
-        return ""
-
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
         """Return the wheel speeds and the deadman after all keys typed so far; None once the terminal is gone."""
         self._handle(now_ns)
         if self._gone:
             return None
         held = self._hold.at(now_ns)
-        return held if self._ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
+        return held if self.ended is None else ManualInput(now_ns, 0.0, 0.0, deadman=False)
 
     def typed(self) -> str:
         """Return the printable keys that drive nothing, typed since it was asked last and seen by a poll."""
@@ -256,20 +241,20 @@ class Keyboard:
         """Act on what has arrived: one event in all, which keeps a poll short however much was typed."""
         keys: list[bytes] = []
         t_ns = now_ns
-        while self._arrived and self._ended is None:
+        while self._arrived and self.ended is None:
             t_ns, data = self._arrived.popleft()
             if not data:
-                self._gone, self._ended = True, "the terminal was closed"
+                self._gone, self.ended = True, "the terminal was closed"
             keys += parse(data)
             if b"\x04" in keys:
-                self._ended = "the operator ended the drive at the keyboard"
-        if keys and self._ended is None:
+                self.ended = "the operator ended the drive at the keyboard"
+        if keys and self.ended is None:
             # Any other key among them wins: it means stop.
             odd = [key for key in keys if key not in DIRECTIONS]
             answers = "".join(key.decode("ascii", "ignore") for key in odd if len(key) == 1 and key.isalnum())
             self._typed = (self._typed + answers)[-_MOST_TYPED:]
             # What came after this tick began counts as of its beginning.
-            self._hold.press(KeyEvent(min(t_ns, now_ns), odd[-1] if odd else keys[-1]))
+            self._hold.press(min(t_ns, now_ns), odd[-1] if odd else keys[-1])
 
     def _read(self) -> None:
         """Wait for keys until there is no terminal, or `close()`; the thread's work."""

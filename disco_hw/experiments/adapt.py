@@ -179,14 +179,9 @@ class AdaptResult:
     def _mean(self, name: str, *, adapted: bool, after: bool) -> float:
         options = self.options
         begin = options.change_s + (options.settled_s if after else -options.compared_s)
-        return float(
-            np.mean(
-                [
-                    run.cost[(run.t_s >= begin) & (run.t_s < begin + options.compared_s)].mean()
-                    for run in self.runs[name, adapted]
-                ]
-            )
-        )
+        end = begin + options.compared_s
+        means = [run.cost[(run.t_s >= begin) & (run.t_s < end)].mean() for run in self.runs[name, adapted]]
+        return float(np.mean(means))
 
     def _smooth(self, name: str, adapted: bool) -> Array:
         runs = self.runs[name, adapted]
@@ -211,7 +206,9 @@ class AdaptResult:
         return float(np.mean(first)) - change_s
 
 
-def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progress | None = None) -> AdaptResult:
+def run_adapt(
+    setup: Setup, options: AdaptOptions | None = None, progress: Progress = lambda _text: None
+) -> AdaptResult:
     """Drive every change with and without adaptation, over all seeds.
 
     `setup`: the robot; the plant is at its model's mean at first, and the belief about it as narrow as after `infer`.
@@ -228,11 +225,9 @@ def run_adapt(setup: Setup, options: AdaptOptions | None = None, progress: Progr
                 drive(setup, _effect(name, options), options, adapted=adapted, seed=seed)
                 for seed in range(options.seed_offset + 1, options.seed_offset + options.seeds + 1)
             ]
-            if progress is not None:
-                cost = np.mean(
-                    [run.cost[run.t_s > options.change_s + options.settled_s].mean() for run in runs[name, adapted]]
-                )
-                progress(f"{name} changes, {'adapting' if adapted else 'not adapting'}: cost afterwards {cost:.4f}")
+            settled_s = options.change_s + options.settled_s
+            cost = np.mean([run.cost[run.t_s > settled_s].mean() for run in runs[name, adapted]])
+            progress(f"{name} changes, {'adapting' if adapted else 'not adapting'}: cost afterwards {cost:.4f}")
     return AdaptResult(options, task, runs)
 
 

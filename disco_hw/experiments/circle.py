@@ -200,7 +200,7 @@ class CircleResult:
 
 
 def run_circle(
-    model: Model, mode: str = "default", options: CircleOptions | None = None, progress: Progress | None = None
+    model: Model, mode: str = "default", options: CircleOptions | None = None, progress: Progress = lambda _text: None
 ) -> CircleResult:
     """Drive the circle with each curve's knowledge, over all seeds; `progress` is called after each curve.
 
@@ -226,8 +226,7 @@ def run_circle(
             for seed, theta in enumerate(plants(model, options.seeds, options.seed_offset), start=options.seed_offset)
         ]
         result = CircleResult(options, circle, mode, {name: runs[name]})
-        if progress is not None:
-            progress(f"{name}: mean cost {result.rows()[0]['mean_cost']:.4f}")
+        progress(f"{name}: mean cost {result.rows()[0]['mean_cost']:.4f}")
     return CircleResult(options, circle, mode, runs)
 
 

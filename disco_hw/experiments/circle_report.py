@@ -62,12 +62,6 @@ class EstimationFigures:
     rms_yaw_rad: float
 
 
-def turned_laps(path: Path, task: CircleTask) -> Array:
-    """Signed laps around the circle's centre since the start of the path, counter-clockwise positive, shape (N,)."""
-    angle = np.unwrap(np.arctan2(path.y_m - task.center_y_m, path.x_m - task.center_x_m))
-    return np.asarray((angle - angle[0]) / (2.0 * np.pi), dtype=np.float64)
-
-
 def circle_figures(path: Path, task: CircleTask) -> CircleFigures:
     """Summarise a path around the circle; raises ValueError for a path of fewer than two samples."""
     if path.t_s.size < 2:
@@ -75,7 +69,8 @@ def circle_figures(path: Path, task: CircleTask) -> CircleFigures:
     distance = np.abs(np.hypot(path.x_m - task.center_x_m, path.y_m - task.center_y_m) - task.radius_m)
     speed_error = path.speed_m_s - task.speed_m_s
     cost = np.hypot(distance, speed_error)
-    laps = turned_laps(path, task)
+    angle = np.unwrap(np.arctan2(path.y_m - task.center_y_m, path.x_m - task.center_x_m))
+    laps = (angle - angle[0]) / (2.0 * np.pi)
     settled = np.maximum.accumulate(laps) >= 0.25
     if not settled.any():
         settled = np.ones_like(settled)

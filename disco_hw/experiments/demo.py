@@ -15,7 +15,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -86,6 +86,16 @@ class DemoOptions:
     port: int = DEFAULT_PORT
     show_progress: bool = True
 
+    @property
+    def log(self) -> Path:
+        """File of the daemon's log."""
+        return self.out / "demo.mcap"
+
+    @property
+    def truth(self) -> Path:
+        """File of the virtual robot's true motion."""
+        return self.out / "truth.csv"
+
 
 def run_demo(options: DemoOptions) -> CircleReport:
     """Drive the circle with a virtual robot and return the figures; prints progress, a table and the files written.
@@ -107,25 +117,16 @@ def run_demo(options: DemoOptions) -> CircleReport:
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=not options.show_progress)
     with _ended_by_signals(), tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
-        robot_file = _write_robot_file(Path(scratch), options)
-        files = _Files(
-            robot=robot_file,
-            socket=Path(scratch) / "control.sock",
-            log=options.out / "demo.mcap",
-            truth=options.out / "truth.csv",
-            simulator_output=options.out / "sim.txt",
-            daemon_output=options.out / "daemon.txt",
-        )
-        stopped = _drive_undisturbed(options, files, console)
+        stopped = _drive_undisturbed(options, _write_robot_file(Path(scratch), options), console)
     task = circle_task(load_robot_config(SHIPPED_ROBOT).task, "the demonstration")
-    report = load_circle_report(files.log, files.truth, task, options.laps, stopped)
+    report = load_circle_report(options.log, options.truth, task, options.laps, stopped)
     if options.obstacle:
         report = replace(report, pillar=PILLAR, footprint=FOOTPRINT)
     picture_file = options.out / "circle.png"
     report.draw(picture_file)
     console.print(report.table())
-    console.print(f"log {files.log}   picture {picture_file}   truth {files.truth}")
-    for line in what_next(options, files.log, picture_file):
+    console.print(f"log {options.log}   picture {picture_file}   truth {options.truth}")
+    for line in what_next(options, options.log, picture_file):
         console.print(line, soft_wrap=True, highlight=False)
     return report
 
@@ -146,16 +147,6 @@ def what_next(options: DemoOptions, log: Path, picture_file: Path) -> list[str]:
         "  disco-hw experiment gap        an effect hidden in the robot, found, named, and driven again with",
         "  disco-hw init                  a robot.toml for a robot of your own",
     ]
-
-
-@dataclass(frozen=True, slots=True)
-class _Files:
-    robot: Path
-    socket: Path
-    log: Path
-    truth: Path
-    simulator_output: Path
-    daemon_output: Path
 
 
 def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
@@ -205,13 +196,13 @@ class _HostStallError(WorkError):
     """The robot's watchdog ended the drive right after the host of this virtual machine took 100 ms or more."""
 
 
-def _drive_undisturbed(options: DemoOptions, files: _Files, console: Console) -> bool:
+def _drive_undisturbed(options: DemoOptions, robot_file: Path, console: Console) -> bool:
     """`_drive`, once more from new processes where the machine's host held it up just before the robot stopped."""
     try:
-        return _drive(options, files, console)
+        return _drive(options, robot_file, console)
     except _HostStallError as error:
         console.print(f"{error}\ndriving anew")
-    return _drive(options, files, console)
+    return _drive(options, robot_file, console)
 
 
 def start_pose(setup: Setup) -> tuple[float, float, float]:
@@ -225,26 +216,28 @@ def start_pose(setup: Setup) -> tuple[float, float, float]:
     return task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi + inwards_rad
 
 
-def _drive(options: DemoOptions, files: _Files, console: Console) -> bool:
+def _drive(options: DemoOptions, robot_file: Path, console: Console) -> bool:
     """Drive and stop the robot; return whether daemon and robot both reported it standing and disarmed."""
-    parts = files.log.parent.glob(f"{files.log.stem}.part*{files.log.suffix}")
-    for old in (files.log, files.truth, *parts):
+    log, truth = options.log, options.truth
+    for old in (log, truth, *log.parent.glob(f"{log.stem}.part*{log.suffix}")):
         old.unlink(missing_ok=True)
-    setup = load_setup(files.robot)
+    setup = load_setup(robot_file)
     task = circle_task(setup.config.task, "the demonstration")
     lap_s = 2.0 * math.pi * task.radius_m / task.speed_m_s
     simulator = [
-        "sim", str(files.robot), "--plant-seed", str(options.plant_seed), "--truth", str(files.truth),
+        "sim", str(robot_file), "--plant-seed", str(options.plant_seed), "--truth", str(truth),
         "--start", *map(str, start_pose(setup)),
     ]  # fmt: skip
     # The daemon hands the variable on to its page.
     os.environ[TOKEN_VARIABLE] = token = page_token()
-    daemon_arguments = ["run", str(files.robot), "--log", str(files.log), *_page(options), *_adapt(options)]
+    daemon_arguments = ["run", str(robot_file), "--log", str(log)]
+    daemon_arguments += ["--view", "--port", str(options.port)] if options.view else []
+    daemon_arguments += ["--adapt"] if options.adapt else []
     with (
-        disco_hw_process("virtual robot", simulator, files.simulator_output) as robot,
-        disco_hw_process("daemon", daemon_arguments, files.daemon_output) as daemon,
+        disco_hw_process("virtual robot", simulator, options.out / "sim.txt") as robot,
+        disco_hw_process("daemon", daemon_arguments, options.out / "daemon.txt") as daemon,
     ):
-        operator = Operator(files.socket, (robot, daemon))
+        operator = Operator(robot_file.with_name("control.sock"), (robot, daemon))
         link = options.link if options.device is None else link_of_device(options.device)
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
         if options.view:
@@ -281,14 +274,6 @@ def _wait_for_page(port: int) -> None:
             return
 
 
-def _page(options: DemoOptions) -> list[str]:
-    return ["--view", "--port", str(options.port)] if options.view else []
-
-
-def _adapt(options: DemoOptions) -> list[str]:
-    return ["--adapt"] if options.adapt else []
-
-
 def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, console: Console) -> None:
     """Show progress until the laps are driven; raises WorkError when it takes longer than `limit_s`."""
     stolen: deque[tuple[float, int]] = deque()
@@ -304,7 +289,7 @@ def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, consol
     next_line = 0.0
     floor = _Floor(circle_task(load_robot_config(SHIPPED_ROBOT).task, "the demonstration"))
     shown = Group(progress, floor) if console.width >= NARROWEST else progress
-    with Live(shown, console=console, refresh_per_second=4) if console.is_terminal else _nothing():
+    with Live(shown, console=console, refresh_per_second=4) if console.is_terminal else nullcontext():
         while True:
             # Taken before a status is asked for: a daemon that is held up answers only afterwards.
             stolen.append((time.monotonic(), stolen_ms()))
@@ -364,8 +349,3 @@ def _why_stopped(operator: Operator, status: Mapping[str, Any], stolen_ms: int) 
     return _HostStallError(
         f"{detail}\nthe host of this virtual machine took {stolen_ms} ms of its processors just before"
     )
-
-
-@contextmanager
-def _nothing() -> Iterator[None]:
-    yield

@@ -28,9 +28,9 @@ from disco_hw.runtime.fence_guard import FenceVerdict
 from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.safe_area import SafeArea
-from disco_hw.runtime.supervisor import UserRequest
-from disco_hw.tasks import RobotTask, task_from
+from disco_hw.tasks import RobotTask
 from disco_hw.tasks.circle import CircleTask
+from disco_hw.tasks.path import PathTask
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
@@ -64,18 +64,10 @@ class FencedDrive:
 class _Hand:
     """A pilot by hand whose wheel speeds somebody else sets."""
 
+    needs_pose, done = False, False
+
     def __init__(self) -> None:
         self.wheels = (0.0, 0.0)
-
-    @property
-    def needs_pose(self) -> bool:
-        """Whether a pose is needed: not by hand; the fence asks for one."""
-        return False
-
-    @property
-    def done(self) -> bool:
-        """Always False, because it drives until the run is over."""
-        return False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Drive at the wheel speeds that are set."""
@@ -185,12 +177,18 @@ def _drive(
     return FencedDrive(fence, places, float(boundaries.clearance_m(places).min()), tuple(left), stops, way_m)
 
 
-def manual_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator, seconds: float) -> FencedDrive:
-    """Wild commands, another one every half second or so, from the middle of the room."""
+def _by_hand(setup: Setup, plant: PlantParameters, rng: np.random.Generator) -> tuple[SimulatedRun, _Hand]:
+    """Return a robot in the middle of the room, started, and the hand that drives it."""
     hand = _Hand()
     start = BodyPose(0.0, 0.0, float(rng.uniform(-np.pi, np.pi)))
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=int(rng.integers(1 << 30))), NoPlanner(), hand)
-    _begin(run)
+    run.start()
+    return run, hand
+
+
+def manual_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator, seconds: float) -> FencedDrive:
+    """Wild commands, another one every half second or so, from the middle of the room."""
+    run, hand = _by_hand(setup, plant, rng)
     top = setup.config.robot.max_wheel_speed_rad_s
     next_s = 0.0
 
@@ -205,10 +203,7 @@ def manual_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator,
 
 def wall_drive(setup: Setup, plant: PlantParameters, rng: np.random.Generator) -> FencedDrive:
     """Straight on at 0.3 m/s from the middle of the room until the guard stops it."""
-    hand = _Hand()
-    start = BodyPose(0.0, 0.0, float(rng.uniform(-np.pi, np.pi)))
-    run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=int(rng.integers(1 << 30))), NoPlanner(), hand)
-    _begin(run)
+    run, hand = _by_hand(setup, plant, rng)
     speed = _WALL_M_S / plant.wheel_radius_m
     hand.wheels = (speed, speed)
     return _drive(run, 14.0, setup.config.fence)
@@ -231,24 +226,18 @@ def task_drive(
     x_m, y_m, yaw_rad = setup.config.task.course().start
     start = BodyPose(x_m, y_m, yaw_rad + facing_rad)
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
-    area, fence = run.core.area, setup.config.fence
-    assert area is not None
+    fence = setup.config.fence
     if not guarded:
-        area = run.core.area = _Overridden(area.guard, fence, FOOTPRINT)
-    _begin(run)
+        run.core.area = _Overridden(run.core.area.guard, fence, FOOTPRINT)
+    run.start()
     return _drive(run, seconds, fence, learning_s=learning_s)
-
-
-def _begin(run: SimulatedRun) -> None:
-    run.run(1.5)
-    run.run(0.5, UserRequest.ARM)
-    run.run(0.02, UserRequest.START)
 
 
 def tight_room(rng: np.random.Generator, clearance_m: float) -> tuple[Fence, CircleTask]:
     """Return a circle at 0.3 m/s in a square room whose walls come so near to the footprint's way."""
     radius_m, turned = float(rng.uniform(0.6, 1.0)), float(rng.uniform(0.0, 2.0 * np.pi))
-    reach_m = math.sqrt(2.0) * (_outer_m(radius_m) + clearance_m)
+    outer_m = max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
+    reach_m = math.sqrt(2.0) * (outer_m + clearance_m)
     corners = [
         (reach_m * math.cos(turned + k * 0.5 * np.pi), reach_m * math.sin(turned + k * 0.5 * np.pi)) for k in range(4)
     ]
@@ -271,20 +260,10 @@ def corridor_setup(rng: np.random.Generator) -> Setup:
     corners = ((behind_m, -side_m), (end_m, -side_m), (end_m, side_m), (behind_m, side_m))
     line = ((0.0, 0.0), (end_m + _BEYOND_M, 0.0))
     # Its way-points stand in no file.
-    task = _task(path="corridor", speed_m_s=_CORRIDOR_M_S)
-    setup = fenced_setup(Fence(keep_in=corners, margin_m=0.01), msgspec.structs.replace(task, points=line))
+    task = PathTask(path="corridor", speed_m_s=_CORRIDOR_M_S, points=line)
+    setup = fenced_setup(Fence(keep_in=corners, margin_m=0.01), task)
     robot = msgspec.structs.replace(setup.config.robot, max_wheel_acceleration_rad_s2=_SOFT_RAD_S2)
     return replace(setup, config=msgspec.structs.replace(setup.config, robot=robot))
-
-
-def _task(**section: Any) -> Any:
-    """Return the task that these fields in [task] of robot.toml would choose."""
-    return task_from(section)
-
-
-def _outer_m(radius_m: float) -> float:
-    """Return how far (m) from the circle's centre a footprint reaches that drives on the circle."""
-    return max(math.hypot(radius_m + y, x) for x, y in FOOTPRINT.corners_m())
 
 
 def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:

@@ -28,7 +28,7 @@ from disco_hw.experiments.virtual import true_parameters
 from disco_hw.gap import WRITTEN, gap
 from disco_hw.gap.report import STAGES, GapReport
 from disco_hw.gap.report.page import summary_lines
-from disco_hw.model import EffectSetting, Gaussian, Model
+from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.reports import BASELINE, MAIN, REFERENCE, as_json, refuse_directory, write_png
 from disco_hw.runtime.assembly import create_planner
@@ -179,9 +179,8 @@ def without_effects(amended: Model, given: Model) -> Model:
     """Return the amended model with the effects of the given one only, and what is believed of the rest."""
     known = {setting.name for setting in given.effects}
     effects = tuple(setting for setting in amended.effects if setting.name in known)
-    kept: list[EffectSetting] = list(effects)
     names = [parameter.name for parameter in BASE_PARAMETERS]
-    names += [f"{setting.name}.{key}" for setting in kept for key in setting.values]
+    names += [f"{setting.name}.{key}" for setting in effects for key in setting.values]
     belief = amended.belief
     if belief is not None:
         places = [place for place, name in enumerate(belief.names) if name in names]

@@ -129,18 +129,14 @@ class PendulumResult:
         write_pictures(figure, path)
 
 
-def _seeds(options: PendulumOptions) -> range:
-    return range(options.seed_offset, options.seed_offset + options.seeds)
-
-
-def run_pendulum(options: PendulumOptions | None = None, progress: Progress | None = None) -> PendulumResult:
+def run_pendulum(options: PendulumOptions | None = None, progress: Progress = lambda _text: None) -> PendulumResult:
     """Run all curves over all seeds; `progress` is called with a text after each curve."""
     options = options or PendulumOptions()
+    seeds = range(options.seed_offset, options.seed_offset + options.seeds)
     costs = {}
     for name in CURVES:
-        costs[name] = np.array([_swing_up(name, seed, options) for seed in _seeds(options)])
-        if progress is not None:
-            progress(f"{name}: mean cost {costs[name].mean():.2f}")
+        costs[name] = np.array([_swing_up(name, seed, options) for seed in seeds])
+        progress(f"{name}: mean cost {costs[name].mean():.2f}")
     return PendulumResult(options, costs)
 
 

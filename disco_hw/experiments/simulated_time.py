@@ -6,7 +6,7 @@ The one harness of experiments, tests and tools. What happens is recorded in mem
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import PLANNER_VERSION, Law, LawController
+from disco_hw.control.plan import PLANNER_VERSION, Law
 from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments.virtual import true_parameters
 from disco_hw.log import MODEL_TOML, Attachment
@@ -26,15 +25,9 @@ from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.recorder import MemoryRecorder
 from disco_hw.model import model_text
 from disco_hw.reports import refuse_file
-from disco_hw.runtime.assembly import (
-    assemble_core,
-    create_fast_adaptation,
-    create_pipeline,
-    create_planner,
-    driver_of,
-)
+from disco_hw.runtime.assembly import assemble_core, create_fast_adaptation, create_pipeline, driver_of, planner_of
 from disco_hw.runtime.core import CoreTick, DaemonCore, FindsWiring, Pilot, TaskPilot
-from disco_hw.runtime.pipeline import Pipeline, Planner
+from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup, kept_files, load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from firmware_protocol.firmware_core import FirmwareConfig
@@ -93,6 +86,7 @@ class SimulatedRun:
         self.now_us = 0
         self._setup = setup
         pipeline = create_pipeline(setup.config, setup.model, planner)
+        chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
         self.core: DaemonCore = assemble_core(
             setup.config,
             robot.host,
@@ -100,16 +94,11 @@ class SimulatedRun:
             pipeline,
             self.recorder,
             self.pilot.needs_pose if needs_pose is None else needs_pose,
-            adaptation=self._adaptation(setup, pipeline),
+            adaptation=create_fast_adaptation(setup, pipeline) if chosen.kind == "fast" else None,
         )
         if isinstance(self.pilot, FindsWiring):
             self.core.directions = None
         self._period_us = round(1e6 / setup.config.control.rate_hz)
-
-    @staticmethod
-    def _adaptation(setup: Setup, pipeline: Pipeline) -> GeometryAdaptation | None:
-        chosen = choose_adaptation(setup.config.control, setup.config.pose, setup.model)
-        return create_fast_adaptation(setup, pipeline) if chosen.kind == "fast" else None
 
     def ticks(self, duration_s: float, *requests: UserRequest) -> Iterator[CoreTick]:
         """Let time pass and give every tick as it comes; the requests come with the first one."""
@@ -125,28 +114,26 @@ class SimulatedRun:
             tick = self.core.tick(
                 now_ns, (*requests, *desired.requests), motion=desired.motion, by_hand=desired.by_hand
             )
-            self.pilot.learn(now_ns, tick, tick.replies[len(requests) :])
+            self.pilot.learn(now_ns, tick, tick.output.replies[len(requests) :])
             requests = ()
             yield tick
 
     def run(self, duration_s: float, *requests: UserRequest) -> list[CoreTick]:
-        """Run for a duration and return all ticks; the requests come with the first one. All ticks are returned."""
+        """Run for a duration and return all ticks; the requests come with the first one."""
         return list(self.ticks(duration_s, *requests))
 
     def start(self) -> None:
         """Arm and start the task; raises WorkError if the robot refuses."""
         self.run(_READY_S)
         for tick in self.ticks(_ARMED_S, UserRequest.ARM):
-            for reply in tick.replies:
+            for reply in tick.output.replies:
                 if not reply.accepted:
                     raise WorkError(f"the virtual robot could not be armed: {reply.text}")
         self.run(self._period_us * 1e-6, UserRequest.START)
 
-    def drive(self, limit_s: float, progress: Callable[[float], None] = lambda t_s: None) -> None:
-        """Let the pilot drive to its end; raises WorkError if it takes longer. `progress` gets the time (s)."""
-        for number, _ in enumerate(self.ticks(limit_s)):
-            if number % 500 == 0:
-                progress(self.now_us * 1e-6)
+    def drive(self, limit_s: float) -> None:
+        """Let the pilot drive to its end; raises WorkError if it takes longer."""
+        for _ in self.ticks(limit_s):
             if self.pilot.done:
                 return
         raise WorkError(f"the drive was not over after {limit_s:.0f} s")
@@ -218,7 +205,7 @@ def drive_virtual(
         virtual = virtual_robot(setup, true_parameters(setup, None), start, effects=hide, seed=seed)
     except HiddenEffectError as error:
         raise InputError(f"hide: {error}") from None
-    run = SimulatedRun(setup, virtual, _planner(setup, law))
+    run = SimulatedRun(setup, virtual, planner_of(setup, law))
     run.start()
     rows: list[tuple[Any, ...]] = []
     events: list[str] = []
@@ -238,9 +225,3 @@ def _at_the_reference_controller(setup: Setup) -> Setup:
     usual = {field.name: field.default for field in msgspec.structs.fields(RobotConfig)}
     changed = {name: usual[name] for name in ("link", "wheels", "pose")}
     return replace(setup, config=msgspec.structs.replace(setup.config, **changed))
-
-
-def _planner(setup: Setup, law: Law | None) -> Planner:
-    if law is None:
-        return create_planner(setup.config, setup.model)
-    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,57 +26,54 @@ _FIRMWARE_MARGIN = 10.0
 _MOST_ACCELERATION_RAD_S2 = 655.0
 
 
-@dataclass(frozen=True, slots=True)
-class SimOptions:
-    """Options of `disco-hw sim`; `start` is x, y (m) and yaw (rad), the task's start if None."""
+def run_sim(
+    robot: Path,
+    *,
+    model: Path | None = None,
+    link: str | None = None,
+    hide: tuple[str, ...] = (),
+    plant_seed: int | None = None,
+    start: tuple[float, float, float] | None = None,
+    truth: Path | None = None,
+    inject: Path | None = None,
+    bus_log: Path | None = None,
+    faults: Path | None = None,
+    seed: int = 1,
+    board: str | None = None,
+) -> int:
+    """Run the virtual robot until SIGTERM or SIGINT; returns the exit code. Raises InputError for wrong options.
 
-    robot: Path
-    model: Path | None = None
-    link: str | None = None
-    hide: tuple[str, ...] = ()
-    plant_seed: int | None = None
-    start: tuple[float, float, float] | None = None
-    truth: Path | None = None
-    inject: Path | None = None
-    bus_log: Path | None = None
-    faults: Path | None = None
-    seed: int = 1
-    board: str | None = None
-
-
-def run_sim(options: SimOptions) -> int:
-    """Run the virtual robot until SIGTERM or SIGINT; returns the exit code. Raises InputError for wrong options."""
-    setup = load_setup(options.robot, options.model, options.link)
+    The arguments are the options of `disco-hw sim`; `start` is x, y (m) and yaw (rad), the task's start if None.
+    """
+    setup = load_setup(robot, model, link)
     config = setup.config
     try:
-        effects = dict(parse_hidden_effects(options.hide).items)
+        effects = dict(parse_hidden_effects(hide).items)
     except HiddenEffectError as error:
         raise InputError(f"--hide: {error}") from None
     try:
-        faults = None
-        if options.faults is not None:
-            faults = schedule_of(read_toml(options.faults, FAULTS_TOML), str(options.faults))
+        schedule = None if faults is None else schedule_of(read_toml(faults, FAULTS_TOML), str(faults))
     except FaultFileError as error:
         raise InputError(str(error)) from None
-    if options.start is not None and not all(map(math.isfinite, options.start)):
-        raise InputError(f"--start: {' '.join(map(str, options.start))} is not a pose; write finite numbers")
+    if start is not None and not all(map(math.isfinite, start)):
+        raise InputError(f"--start: {' '.join(map(str, start))} is not a pose; write finite numbers")
     ticks_per_rev = _tick_count(setup)
     driver = find_driver(config.link.driver)
     create_controller = None if driver.name == DEFAULT else find_controller(driver.name)
     if not driver.name == DEFAULT and create_controller is None:
         raise InputError(f"{setup.robot_file}: link.driver: there is no simulator of {driver.name}")
-    if options.board is not None and not driver.name == DEFAULT:
+    if board is not None and not driver.name == DEFAULT:
         raise InputError(
             f"--board: {setup.robot_file} has link.driver {driver.name}; a board needs the driver reference"
         )
-    if options.board is not None and options.bus_log is not None:
+    if board is not None and bus_log is not None:
         raise InputError("--bus-log: cannot be used with --board, which has its own link; leave one of them out")
     controller = (
         None if create_controller is None else partial(create_controller, config.link.settings(), ticks_per_rev)
     )
-    x_m, y_m, yaw_rad = options.start or config.task.course().start
+    x_m, y_m, yaw_rad = start or config.task.course().start
     # The robot that a model without effects describes; what its motors should lack is hidden by the user.
-    plant, key = true_parameters(setup, options.plant_seed).with_ideal_motors(), link_key(setup)
+    plant, key = true_parameters(setup, plant_seed).with_ideal_motors(), link_key(setup)
     print(
         f"true wheel radius {plant.wheel_radius_m:.4f} m, axial distance {plant.axial_distance_m:.4f} m, "
         f"x_icr {plant.x_icr_m:.4f} m" + "".join(f", hidden {name} {values}" for name, values in effects.items()),
@@ -91,11 +88,11 @@ def run_sim(options: SimOptions) -> int:
             bitrate=config.link.bitrate,
             port=config.link.port,
             baud=config.link.baud,
-            board=options.board,
+            board=board,
             start=BodyPose(x_m, y_m, yaw_rad),
             plant=plant,
             effects=effects,
-            seed=options.seed,
+            seed=seed,
             firmware=FirmwareConfig(
                 ticks_per_rev=ticks_per_rev,
                 max_wheel_speed_rad_s=config.robot.max_wheel_speed_rad_s,
@@ -108,10 +105,10 @@ def run_sim(options: SimOptions) -> int:
             pose_address=None
             if (by_datagram := config.pose.of(UDP_POSES)) is None
             else (by_datagram.address, by_datagram.port),
-            truth_file=options.truth,
-            bus_log=options.bus_log,
-            inject=options.inject,
-            faults=faults,
+            truth_file=truth,
+            bus_log=bus_log,
+            inject=inject,
+            faults=schedule,
         )
     )
 

@@ -201,7 +201,9 @@ def run_init(options: InitOptions, ask: Callable[[str], str] | None, show: Calla
         raise InputError(f"{options.out}: is there already; name another file, or give --overwrite")
     link = link_fields(options.link)
     controller = _controller(options, link, ask, show)
-    text = robot_text(options, link, controller, _measures(options, ask))
+    given = dict(options.measures)
+    measures = {one.name: given[one.name] if one.name in given else _prompt_for(one, ask) for one in QUESTIONS}
+    text = robot_text(options, link, controller, measures)
     trial = options.out.with_name(f".{options.out.name}.new")
     try:
         options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -278,11 +280,6 @@ def _answering(
     if not found:
         show(f"no answer from {names}; check that it is switched on and set to answer (packet serial)")
     return tuple(found)
-
-
-def _measures(options: InitOptions, ask: Callable[[str], str] | None) -> dict[str, float]:
-    given = dict(options.measures)
-    return {one.name: given[one.name] if one.name in given else _prompt_for(one, ask) for one in QUESTIONS}
 
 
 def _prompt_for(prompt: FieldPrompt, ask: Callable[[str], str] | None) -> float:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +14,11 @@ import msgspec
 
 from disco_hw.config import Robot, load_robot_config
 from disco_hw.daemon.loop import MonotonicClock
-from disco_hw.daemon.process import STANDARD_ERROR, AsyncPrinter
-from disco_hw.daemon.run import in_text, serve
+from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_INPUT, AsyncPrinter
+from disco_hw.daemon.run import in_text, new_log, serve
 from disco_hw.drive.terminal import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
-from disco_hw.files import ROBOT_TOML, file_name_of, read_bytes
+from disco_hw.files import ROBOT_TOML, read_bytes
 from disco_hw.first_use import in_toml, with_fields
 from disco_hw.first_use.judgement import Findings, evaluate_floor, evaluate_sides, evaluate_turns
 from disco_hw.first_use.procedure import CommissionPilot, Procedure, Steps, floor, sides, turns
@@ -27,8 +26,6 @@ from disco_hw.reports import refuse_directory
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from drivers.motor import find_driver
 
-# File descriptor (POSIX).
-_STANDARD_INPUT = 0
 # Chosen: a fault may hide another; what is not mended by then needs a person who looks.
 _MOST_TRIES = 3
 _UP = "wheels off the ground"
@@ -92,12 +89,9 @@ class CommissionResult:
         lines = []
         for stage in self.stages:
             lines += [f"{stage['name']}: {figure}" for figure in stage["figures"]]
-            lines += [f"{stage['name']}: {fault['name']}: {_how(fault)}" for fault in stage["faults"]]
+            for fault in stage["faults"]:
+                lines.append(f"{stage['name']}: {fault['name']}: {'corrected' if fault['mended'] else fault['text']}")
         return "\n".join([*lines, "commissioned" if self.ok else "not commissioned: correct what is named above"])
-
-
-def _how(fault: dict[str, Any]) -> str:
-    return "corrected" if fault["mended"] else str(fault["text"])
 
 
 def slowest_rad_s(setup: Setup) -> float:
@@ -131,9 +125,9 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
         if name not in known:
             raise InputError(f"--stage {name}: no such stage; write one of {', '.join(known)}")
     setup = load_setup(options.robot, None, options.link)
-    refuse_directory(_log_directory(options, setup))
+    refuse_directory(options.log_directory or Path(setup.config.log.directory))
     link_key(setup)
-    if not os.isatty(_STANDARD_INPUT):
+    if not os.isatty(STANDARD_INPUT):
         raise InputError(
             "commission: standard input is not a terminal; it needs an operator at the robot: use a terminal"
         )
@@ -169,6 +163,11 @@ def _through(
     return False
 
 
+def is_yes(reply: str) -> bool:
+    """Whether an operator's reply says yes."""
+    return reply.strip().lower() in {"y", "yes"}
+
+
 def write_fields(
     options: CommissionOptions, edits: dict[tuple[str, str], Any], ask: Callable[[str], str] = input
 ) -> bool:
@@ -180,7 +179,7 @@ def write_fields(
         print(f"  [{section}] {name} = {in_toml(value)}", file=sys.stderr)
     write = options.write
     if write is None:
-        write = ask(f"write this into {options.robot}? [y/n] ").strip().lower() in {"y", "yes"}
+        write = is_yes(ask(f"write this into {options.robot}? [y/n] "))
     if not write:
         return False
     old, _ = read_bytes(options.robot, ROBOT_TOML)
@@ -203,10 +202,9 @@ def write_fields(
 
 def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     """One drive through the daemon; what its procedure returned. Raises WorkError if the person gave up."""
-    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    name = file_name_of(setup.config.robot.name)
-    log = _log_directory(options, setup) / f"{name}-commission-{stage.name}-{stamp}.mcap"
-    keyboard = Keyboard(_STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
+    log = new_log(setup.config, f"commission-{stage.name}-")
+    log = (options.log_directory or log.parent) / log.name
+    keyboard = Keyboard(STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
     procedure = Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup)))
     pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.is_ignored)
     try:
@@ -220,10 +218,6 @@ def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     if pilot.procedure.action is not None:
         raise WorkError(f"commission: ended in the stage {stage.name}; continue with --stage {stage.name}")
     return pilot.procedure.result
-
-
-def _log_directory(options: CommissionOptions, setup: Setup) -> Path:
-    return options.log_directory or Path(setup.config.log.directory)
 
 
 def _print(topic: str, text: str) -> None:

@@ -16,7 +16,7 @@ from disco_hw.drive.drive_command import DriveOptions, DriveResult, run_drive
 from disco_hw.errors import InputError
 from disco_hw.fence import Fence, Footprint, Polygon, fence_fault
 from disco_hw.first_use import in_toml
-from disco_hw.first_use.commission import CommissionOptions, write_fields
+from disco_hw.first_use.commission import CommissionOptions, is_yes, write_fields
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Estimate
 from disco_hw.runtime.robot_setup import setup_of_log
@@ -71,7 +71,7 @@ def record_fence(
     can be driven again. Raises InputError and WorkError as the drive does.
     """
     prompt = _PROMPT
-    while _is_yes(ask(prompt)):
+    while is_yes(ask(prompt)):
         print(f"{how}; Ctrl-D ends the recording", file=sys.stderr, flush=True)
         log = drive(DriveOptions(robot, link=link)).log
         try:
@@ -82,10 +82,6 @@ def record_fence(
             continue
         return write_fields(CommissionOptions(robot), {("fence", "keep_in"): [list(one) for one in keep_in]}, ask)
     return False
-
-
-def _is_yes(reply: str) -> bool:
-    return reply.strip().lower() in {"y", "yes"}
 
 
 class NoFence(ValueError):  # noqa: N818

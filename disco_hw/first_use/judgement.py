@@ -12,19 +12,12 @@ from itertools import pairwise, product
 from statistics import median
 from typing import Any, Literal
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.config import Robot
-from disco_hw.first_use.procedure import (
-    RUNAWAY_SHARE,
-    SIDES,
-    SLOWING,
-    FloorSeen,
-    SideSeen,
-    Track,
-    TurnsSeen,
-)
+from disco_hw.first_use.procedure import RUNAWAY_SHARE, SIDES, SLOWING, FloorSeen, SideSeen, Track, TurnsSeen
 from drivers.motor import Wiring
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample
@@ -122,55 +115,29 @@ def _wiring_faults(seen: Sequence[SideSeen], old: Wiring) -> list[Fault]:
     if dead:
         names = " and ".join(SIDES[side] for side in dead)
         return [Fault("encoder dead", f"the {names} wheel turned but its encoder did not count; check its cable")]
-    faults = []
+    found: list[tuple[str, str]] = []
+    edits: dict[tuple[str, str], Any] = {}
     if swapped != old.sides_swapped:
-        faults.append(
-            Fault(
-                "sides swapped",
-                "the controller's left side drives the right wheels",
-                {("wheels", "sides_swapped"): swapped},
-            )
-        )
+        found.append(("sides swapped", "the controller's left side drives the right wheels"))
+        edits["wheels", "sides_swapped"] = swapped
     if crossed != old.encoders_swapped:
-        faults.append(
-            Fault(
-                "encoders swapped",
-                "the left and right encoders are exchanged",
-                {("wheels", "encoders_swapped"): crossed},
-            )
-        )
-    for side in (0, 1):
-        motor_wrong = seen["lr".index(_side_of(seen, side))].seen[1] == "b"
-        if motor_wrong:
-            faults.append(
-                Fault(
-                    f"{SIDES[side]} motor reversed",
-                    f"forward turns the {SIDES[side]} wheels backward",
-                    {("wheels", "motor_direction"): motors},
-                )
-            )
+        found.append(("encoders swapped", "the left and right encoders are exchanged"))
+        edits["wheels", "encoders_swapped"] = crossed
+    for one in sorted(seen, key=lambda one: one.seen[0]):
+        side = "lr".index(one.seen[0])
+        name = SIDES[side]
+        if one.seen[1] == "b":
+            found.append((f"{name} motor reversed", f"forward turns the {name} wheels backward"))
+            edits["wheels", "motor_direction"] = motors
         elif encoders[side] != old.encoder_direction[side]:
-            faults.append(
-                Fault(
-                    f"{SIDES[side]} encoder reversed",
-                    f"the {SIDES[side]} encoder counts down when its wheel turns forward",
-                    {("wheels", "encoder_direction"): encoders},
-                )
-            )
+            found.append((f"{name} encoder reversed", f"the {name} encoder counts down when its wheel turns forward"))
+            edits["wheels", "encoder_direction"] = encoders
     if encoders != list(old.encoder_direction):
-        faults = [_with(fault, ("wheels", "encoder_direction"), encoders) for fault in faults]
+        edits["wheels", "encoder_direction"] = encoders
     if motors != list(old.motor_direction):
-        faults = [_with(fault, ("wheels", "motor_direction"), motors) for fault in faults]
-    return faults
-
-
-def _side_of(seen: Sequence[SideSeen], side: int) -> str:
-    """Return which commanded side turned this one, as a letter."""
-    return "lr"[next(commanded for commanded, one in enumerate(seen) if "lr".index(one.seen[0]) == side)]
-
-
-def _with(fault: Fault, place: tuple[str, str], value: Any) -> Fault:
-    return Fault(fault.name, fault.text, {**fault.edits, place: value})
+        edits["wheels", "motor_direction"] = motors
+    # Each needs all the others: a wheel that is found under another name has that one's direction.
+    return [Fault(name, text, edits) for name, text in found]
 
 
 def _dead_band(side: int, track: Track) -> str:
@@ -325,12 +292,10 @@ _SAME_RAD = 0.35
 _OFFSET_RAD = 0.2
 # The nearest multiple of it is what the mounting was meant to be.
 _QUARTER = 0.5 * math.pi
+_UNITS = ("position_unit", "yaw_unit", "clockwise", "mirrored")
 _METRES: tuple[Literal["m", "cm", "mm"], ...] = ("m", "cm", "mm")
 _RADIANS: tuple[Literal["rad", "deg"], ...] = ("rad", "deg")
-_CHOICES = tuple(
-    PoseConvention(unit, yaw, clockwise, mirrored)
-    for unit, yaw, clockwise, mirrored in product(_METRES, _RADIANS, (False, True), (False, True))
-)
+_CHOICES = tuple(PoseConvention(*units) for units in product(_METRES, _RADIANS, (False, True), (False, True)))
 
 
 @dataclass(frozen=True)
@@ -345,12 +310,7 @@ class _Fit:
 
 
 def _same_units(found: PoseConvention, configured: PoseConvention) -> bool:
-    return (found.position_unit, found.yaw_unit, found.clockwise, found.mirrored) == (
-        configured.position_unit,
-        configured.yaw_unit,
-        configured.clockwise,
-        configured.mirrored,
-    )
+    return all(getattr(found, name) == getattr(configured, name) for name in _UNITS)
 
 
 def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
@@ -369,13 +329,7 @@ def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
     near = _QUARTER * round(offset / _QUARTER)
     offset = near if abs(offset - near) < _OFFSET_RAD else offset
     return _Fit(
-        PoseConvention(
-            choice.position_unit,
-            choice.yaw_unit,
-            choice.clockwise,
-            choice.mirrored,
-            math.remainder(offset, 2 * math.pi),
-        ),
+        msgspec.structs.replace(choice, yaw_offset_rad=math.remainder(offset, 2 * math.pi)),
         abs(math.remainder(first - second, 2.0 * math.pi)),
         wheels_m,
         poses_m,
@@ -411,10 +365,11 @@ def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
 
 
 def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
+    way = "clockwise" if found.convention.clockwise else "counter-clockwise"
     names = {
         "position_unit": ("pose in other units", f"positions come in {found.convention.position_unit}"),
         "yaw_unit": ("yaw in other units", f"the yaw comes in {found.convention.yaw_unit}"),
-        "clockwise": ("yaw the other way round", _clockwise(found.convention.clockwise)),
+        "clockwise": ("yaw the other way round", f"the yaw grows {way}"),
         "mirrored": ("axes mirrored", "left and right are exchanged in the frame of the poses"),
     }
     faults = [
@@ -435,10 +390,6 @@ def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
     return faults
 
 
-def _clockwise(clockwise: bool) -> str:
-    return "the yaw grows clockwise" if clockwise else "the yaw grows counter-clockwise"
-
-
 def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     """Return lines on where the sensor sits beside the centre of the turns, and its delay against the wheels."""
     convention = best.convention
@@ -448,10 +399,13 @@ def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     ahead = "ahead of" if forward > 0.0 else "behind"
     aside = "left" if left > 0.0 else "right"
     direction = "behind" if _mean(delays) > 0.0 else "ahead of"
+    poses = seen.straight.poses
+    rate_hz = (len(poses) - 1) / max(1e-9, (poses[-1].t_ns - poses[0].t_ns) * 1e-9)
+    age_ms = median((pose.received_ns - pose.t_ns) * 1e-6 for pose in poses)
     lines = [
         f"lever arm: the sensor is {abs(forward):.2f} m {ahead} and {abs(left):.2f} m to the {aside} of the point "
         f"about which the robot turns (x_icr_m = {-forward:.2f})",
-        f"poses: {_rate(seen):.0f} a second, {_age_ms(seen):.0f} ms old on arrival, their stamps "
+        f"poses: {rate_hz:.0f} a second, {age_ms:.0f} ms old on arrival, their stamps "
         f"{abs(1e3 * _mean(delays)):.0f} ms {direction} the wheels'",
     ]
     if abs(left) > POSE_STD_LEFT_M:
@@ -487,12 +441,3 @@ def _mismatch(
     base = np.column_stack([np.ones_like(at), np.interp(at, t, turn)])
     left = yaw - base @ np.linalg.lstsq(base, yaw, rcond=None)[0]
     return float(left @ left)
-
-
-def _age_ms(seen: FloorSeen) -> float:
-    return median((pose.received_ns - pose.t_ns) * 1e-6 for pose in seen.straight.poses)
-
-
-def _rate(seen: FloorSeen) -> float:
-    poses = seen.straight.poses
-    return (len(poses) - 1) / max(1e-9, (poses[-1].t_ns - poses[0].t_ns) * 1e-9)

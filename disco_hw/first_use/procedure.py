@@ -322,7 +322,7 @@ def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
     """
     limit_s = 1.5 * travel_m / (max(wheels) * robot.wheel_radius_m)
     track, driven_ns, last_ns = Track(), 0, 0
-    while not track.commands or not _at_rest_long(track):
+    while not track.commands or (track.commands[-1][0] - track.commands[0][0]) * 1e-9 < _REST_S:
         seen: Seen = yield DriveWheels((0.0, 0.0), f"hold: {what}")
         if seen.driving:
             track.add(seen)
@@ -338,40 +338,32 @@ def _leg(robot: Robot, wheels: Wheels, travel_m: float, what: str) -> Steps:
     return track
 
 
-def _at_rest_long(track: Track) -> bool:
-    return (track.commands[-1][0] - track.commands[0][0]) * 1e-9 >= _REST_S
-
-
 class Procedure:
     """Runner of steps, which `see` moves on and `answer` hands a key; `result` is what the steps returned."""
 
     def __init__(self, steps: Steps) -> None:
         self._steps = steps
-        self._action: Action | None = next(steps)
-        self.result: Any = None
-
-    @property
-    def action(self) -> Action | None:
+        self.action: Action | None = next(steps)
         """Action that is due now; None when all is done."""
-        return self._action
+        self.result: Any = None
 
     def see(self, seen: Seen) -> None:
         """Hand on what the tick saw; a question waits for its answer instead."""
-        if self._action is not None and not isinstance(self._action, Prompt):
+        if self.action is not None and not isinstance(self.action, Prompt):
             self._send(seen)
 
     def answer(self, key: str) -> bool:
         """Answer the question that waits; whether this key is one of its answers."""
-        if not isinstance(self._action, Prompt) or key not in self._action.keys:
+        if not isinstance(self.action, Prompt) or key not in self.action.keys:
             return False
         self._send(key)
         return True
 
     def _send(self, value: Seen | str) -> None:
         try:
-            self._action = self._steps.send(value)
+            self.action = self._steps.send(value)
         except StopIteration as end:
-            self._action, self.result = None, end.value
+            self.action, self.result = None, end.value
 
 
 # Chosen: a fault that the procedure clears by itself lasts for less.
@@ -384,6 +376,9 @@ class CommissionPilot:
     `keys`: those typed since it was asked last, for the procedure's questions. `is_ignored`: whether a key is held that
     does not count, which the person is told once.
     """
+
+    # This drive is there to find the wiring, and whether the poses are right.
+    needs_pose, finds_wiring = False, True
 
     def __init__(
         self,
@@ -404,16 +399,6 @@ class CommissionPilot:
         self._fault_ns: int | None = None
         self.fault_text: str | None = None
         """The fault that ended the drive, in words."""
-
-    @property
-    def needs_pose(self) -> bool:
-        """Whether the poses are right is to be found."""
-        return False
-
-    @property
-    def finds_wiring(self) -> bool:
-        """Always True, because this drive is there to find the wiring."""
-        return True
 
     @property
     def done(self) -> bool:

@@ -29,32 +29,38 @@ class State(enum.Enum):
     FAULT = "fault"
 
 
-class Condition(enum.Flag):
-    """Conditions that hold in one tick, in which the table of transitions is written."""
+IN_USE = frozenset({State.ARMED, State.STOPPING})
+"""States in which nothing may be changed that a drive depends on."""
+
+
+class Condition:
+    """Conditions that hold in one tick, in which the table of transitions is written: bits of an integer.
+
+    Flags of `enum` cost a microsecond an operation in Python 3.11, and these are combined in every tick.
+    """
 
     NONE = 0
-    LINK_UP = enum.auto()
-    LINK_RENEWED = enum.auto()  # the link was down since the last step, however short
-    ROBOT_TALKS = enum.auto()  # handshake complete, whatever the robot's state
-    ROBOT_IDLE = enum.auto()  # robot in standby or ready: it executes nothing
-    ROBOT_ARMED = enum.auto()
-    ROBOT_MAY_MOVE = enum.auto()  # robot arming, armed or stopping
-    ROBOT_REFUSED = enum.auto()
-    ROBOT_FAULT = enum.auto()
-    ROBOT_ESTOP = enum.auto()
-    TELEMETRY_FRESH = enum.auto()
-    TELEMETRY_LOST = enum.auto()
-    WHEELS_STATIONARY = enum.auto()
-    ARM_PENDING = enum.auto()
-    DISARM_REQUESTED = enum.auto()
-    ESTOP_REQUESTED = enum.auto()  # held from the request until a reset is accepted
-    RESET_PENDING = enum.auto()
-    PREFLIGHT_ERROR = enum.auto()
-    DAEMON_ERROR = enum.auto()
+    LINK_UP = 1 << 0
+    LINK_RENEWED = 1 << 1  # the link was down since the last step, however short
+    ROBOT_TALKS = 1 << 2  # handshake complete, whatever the robot's state
+    ROBOT_IDLE = 1 << 3  # robot in standby or ready: it executes nothing
+    ROBOT_ARMED = 1 << 4
+    ROBOT_MAY_MOVE = 1 << 5  # robot arming, armed or stopping
+    ROBOT_REFUSED = 1 << 6
+    ROBOT_FAULT = 1 << 7
+    ROBOT_ESTOP = 1 << 8
+    TELEMETRY_FRESH = 1 << 9
+    TELEMETRY_LOST = 1 << 10
+    WHEELS_STATIONARY = 1 << 11
+    ARM_PENDING = 1 << 12
+    DISARM_REQUESTED = 1 << 13
+    ESTOP_REQUESTED = 1 << 14  # held from the request until a reset is accepted
+    RESET_PENDING = 1 << 15
+    PREFLIGHT_ERROR = 1 << 16
 
 
 C = Condition
-PROBLEM = C.DAEMON_ERROR | C.ESTOP_REQUESTED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
+PROBLEM = C.ESTOP_REQUESTED | C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED | C.PREFLIGHT_ERROR
 _CONNECTED = frozenset(State) - {State.DISCONNECTED}
 _UNTROUBLED = _CONNECTED - {State.FAULT}
 
@@ -65,13 +71,9 @@ class Transition:
 
     sources: frozenset[State]
     target: State
-    needs: Condition
-    blocked_by: Condition
+    needs: int
+    blocked_by: int
     reason: str
-
-
-def _row(sources: frozenset[State], target: State, needs: Condition, blocked_by: Condition, reason: str) -> Transition:
-    return Transition(sources, target, needs, blocked_by, reason)
 
 
 def _from(*states: State) -> frozenset[State]:
@@ -82,24 +84,23 @@ S = State
 _NO_WHEEL_DATA = "no wheel data from the robot; check the cable and the robot's power"
 TRANSITIONS: tuple[Transition, ...] = (
     # A lost link ends everything agreed with the robot.
-    _row(_CONNECTED, S.DISCONNECTED, C.NONE, C.LINK_UP, "the link is down"),
-    _row(_CONNECTED, S.DISCONNECTED, C.LINK_RENEWED, C.NONE, "the link was interrupted"),
+    Transition(_CONNECTED, S.DISCONNECTED, C.NONE, C.LINK_UP, "the link is down"),
+    Transition(_CONNECTED, S.DISCONNECTED, C.LINK_RENEWED, C.NONE, "the link was interrupted"),
     # Problems latch until a reset.
-    _row(_UNTROUBLED, S.FAULT, C.DAEMON_ERROR, C.NONE, "the daemon failed"),
-    _row(_UNTROUBLED, S.FAULT, C.ESTOP_REQUESTED, C.NONE, "e-stop requested by the operator"),
-    _row(_UNTROUBLED, S.FAULT, C.ROBOT_ESTOP, C.NONE, "the robot is in e-stop"),
-    _row(_UNTROUBLED, S.FAULT, C.ROBOT_FAULT, C.NONE, "the robot reports a fault"),
-    _row(_UNTROUBLED, S.FAULT, C.ROBOT_REFUSED, C.NONE, "the handshake was refused"),
-    _row(_UNTROUBLED, S.FAULT, C.PREFLIGHT_ERROR, C.NONE, "a preflight check failed"),
-    _row(_from(S.FAULT), S.HANDSHAKE, C.RESET_PENDING, PROBLEM, "reset"),
+    Transition(_UNTROUBLED, S.FAULT, C.ESTOP_REQUESTED, C.NONE, "e-stop requested by the operator"),
+    Transition(_UNTROUBLED, S.FAULT, C.ROBOT_ESTOP, C.NONE, "the robot is in e-stop"),
+    Transition(_UNTROUBLED, S.FAULT, C.ROBOT_FAULT, C.NONE, "the robot reports a fault"),
+    Transition(_UNTROUBLED, S.FAULT, C.ROBOT_REFUSED, C.NONE, "the handshake was refused"),
+    Transition(_UNTROUBLED, S.FAULT, C.PREFLIGHT_ERROR, C.NONE, "a preflight check failed"),
+    Transition(_from(S.FAULT), S.HANDSHAKE, C.RESET_PENDING, PROBLEM, "reset"),
     # Motion is taken away.
-    _row(_from(S.ARMED), S.STOPPING, C.DISARM_REQUESTED, C.NONE, "disarm requested"),
-    _row(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, _NO_WHEEL_DATA),
-    _row(_from(S.ARMED), S.STOPPING, C.NONE, C.ROBOT_ARMED, "the robot is no longer armed"),
-    _row(
+    Transition(_from(S.ARMED), S.STOPPING, C.DISARM_REQUESTED, C.NONE, "disarm requested"),
+    Transition(_from(S.ARMED), S.STOPPING, C.TELEMETRY_LOST, C.NONE, _NO_WHEEL_DATA),
+    Transition(_from(S.ARMED), S.STOPPING, C.NONE, C.ROBOT_ARMED, "the robot is no longer armed"),
+    Transition(
         _from(S.READY), S.STOPPING, C.ROBOT_MAY_MOVE, C.ARM_PENDING, "the robot armed without a request from this host"
     ),
-    _row(
+    Transition(
         _from(S.HANDSHAKE),
         S.STOPPING,
         C.ROBOT_MAY_MOVE,
@@ -107,13 +108,13 @@ TRANSITIONS: tuple[Transition, ...] = (
         "the robot was already armed when this daemon connected",
     ),
     # The robot restarted or fell silent.
-    _row(_from(S.READY, S.STOPPING), S.HANDSHAKE, C.NONE, C.ROBOT_TALKS, "the robot started a new handshake"),
-    _row(_from(S.READY), S.HANDSHAKE, C.TELEMETRY_LOST, C.NONE, _NO_WHEEL_DATA),
+    Transition(_from(S.READY, S.STOPPING), S.HANDSHAKE, C.NONE, C.ROBOT_TALKS, "the robot started a new handshake"),
+    Transition(_from(S.READY), S.HANDSHAKE, C.TELEMETRY_LOST, C.NONE, _NO_WHEEL_DATA),
     # The way up.
-    _row(_from(S.DISCONNECTED), S.HANDSHAKE, C.LINK_UP, C.NONE, "the link is up"),
-    _row(_from(S.HANDSHAKE), S.READY, C.ROBOT_IDLE | C.TELEMETRY_FRESH, C.NONE, "handshake complete"),
-    _row(_from(S.READY), S.ARMED, C.ARM_PENDING | C.ROBOT_ARMED | C.TELEMETRY_FRESH, C.NONE, "armed on request"),
-    _row(
+    Transition(_from(S.DISCONNECTED), S.HANDSHAKE, C.LINK_UP, C.NONE, "the link is up"),
+    Transition(_from(S.HANDSHAKE), S.READY, C.ROBOT_IDLE | C.TELEMETRY_FRESH, C.NONE, "handshake complete"),
+    Transition(_from(S.READY), S.ARMED, C.ARM_PENDING | C.ROBOT_ARMED | C.TELEMETRY_FRESH, C.NONE, "armed on request"),
+    Transition(
         _from(S.STOPPING),
         S.READY,
         C.ROBOT_IDLE | C.WHEELS_STATIONARY | C.TELEMETRY_FRESH,
@@ -123,17 +124,13 @@ TRANSITIONS: tuple[Transition, ...] = (
 )
 
 
-# On the integers below the flags: this runs in every tick, and flags cost a microsecond an operation.
-_ROWS_FROM = {
-    state: tuple((row.needs.value, row.blocked_by.value, row) for row in TRANSITIONS if state in row.sources)
-    for state in State
-}
+_ROWS_FROM = {state: tuple(row for row in TRANSITIONS if state in row.sources) for state in State}
 
 
 def next_transition(state: State, conditions: int) -> Transition | None:
     """Return the first row that leads out of `state`, or None to stay; `conditions` is the mask of those that hold."""
-    for needs, blocked_by, row in _ROWS_FROM[state]:
-        if conditions & needs == needs and not conditions & blocked_by:
+    for row in _ROWS_FROM[state]:
+        if conditions & row.needs == row.needs and not conditions & row.blocked_by:
             return row
     return None
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import msgspec
 
 from disco_hw import control
-from disco_hw.adaptation import GeometryAdaptation
+from disco_hw.adaptation import GeometryAdaptation, NoAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import (
     REQUESTED_BY_FILE,
@@ -20,6 +21,7 @@ from disco_hw.adaptation.guard import (
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
 from disco_hw.control.past_motion import DriveMeans
+from disco_hw.control.plan import Law, LawController
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
@@ -36,7 +38,7 @@ from disco_hw.runtime.core import DaemonCore
 from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
 from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
-from disco_hw.runtime.preflight import check_firmware_limits, check_task, failures
+from disco_hw.runtime.preflight import Level, check_firmware_limits, check_task
 from disco_hw.runtime.robot_setup import Setup, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
 from drivers.motor import create_driver, find_driver, rewired
@@ -65,6 +67,13 @@ def create_planner(config: RobotConfig, model: Model) -> control.Disco:
     )
     planner.warm_up()
     return planner
+
+
+def planner_of(setup: Setup, law: Law | None) -> Planner:
+    """Return the planner of this robot's task: DISCO, or a control law of the user's in its place."""
+    if law is None:
+        return create_planner(setup.config, setup.model)
+    return LawController(law, setup.model, setup.config.task.planned(setup.config.control.mode))
 
 
 def create_surroundings(config: RobotConfig, settings: control.DiscoSettings) -> Surroundings | None:
@@ -186,16 +195,11 @@ def assemble_core(
             heading_required=needs_pose,
         )
     )
-
-    def check(robot: Driver) -> tuple[str, ...]:
-        # Who drives by hand, and so without a pose, does not do the task.
-        return preflight(config, robot, with_task=needs_pose)
-
-    pose_source = pose_source_of(config)
-    obstacles = obstacle_source_of(config)
-    return DaemonCore(
-        config, transport, driver, supervisor, pipeline, recorder, check, adaptation, pose_source, obstacles
-    )
+    # Who drives by hand, and so without a pose, does not do the task.
+    check = partial(preflight, config, with_task=needs_pose)
+    sources = pose_source_of(config), obstacle_source_of(config)
+    adapting = adaptation or NoAdaptation()
+    return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adapting, *sources)
 
 
 def pose_source_of(config: RobotConfig) -> PoseSource:
@@ -208,7 +212,7 @@ def pose_source_of(config: RobotConfig) -> PoseSource:
             source = create_pose_source(
                 **msgspec.structs.asdict(named), key=_pose_key(named), sender_silence_s=silence_s
             )
-        except (KeyFileError, PoseSourceError) as error:
+        except (InputError, KeyFileError, PoseSourceError) as error:
             for one in opened:
                 one.close()
             which = "" if named is config.pose else f" {label}"
@@ -222,10 +226,7 @@ def _pose_key(named: PoseInput) -> bytes | None:
     if named.key_file is None:
         return None
     path = Path(named.key_file)
-    try:
-        return key_of_file(path, *read_bytes(path, KEY))
-    except InputError as error:
-        raise KeyFileError(str(error)) from None
+    return key_of_file(path, *read_bytes(path, KEY))
 
 
 def driver_of(config: RobotConfig, key: bytes | None = None) -> Driver:
@@ -240,7 +241,7 @@ def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tu
     checks = check_firmware_limits(config.robot, driver.limits)
     if with_task:
         checks.append(check_task(config.robot, config.task))
-    return failures(checks)
+    return tuple(check.text for check in checks if check.level is Level.FAIL)
 
 
 def create_link(setup: Setup) -> ReconnectingTransport:

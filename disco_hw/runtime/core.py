@@ -6,7 +6,6 @@ a pilot says: the task's planner, or somebody in its place.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -14,23 +13,21 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
-from disco_hw.adaptation import GeometryAdaptation, NoAdaptation
+from disco_hw.adaptation import GeometryAdaptation
 from disco_hw.config import RobotConfig
 from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
+from disco_hw.runtime.directions import Directions
 from disco_hw.runtime.obstacles import ObstacleRefused, UdpObstacles
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
-from disco_hw.runtime.planner_events import FOLLOWS, PlannerEvents
-from disco_hw.runtime.plausibility import Directions, Headway, Plausibility, PlausibilityStats
-from disco_hw.runtime.pose_jumps import PoseJumps
+from disco_hw.runtime.plausibility import FOLLOWS, Headway, PlannerEvents, Plausibility, PlausibilityStats, PoseJumps
 from disco_hw.runtime.robot_setup import record_of
 from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.runtime.wheel_faults import WheelFaults
 from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
-from drivers.pose.robot import RobotPoses
 from drivers.types import (
     Driver,
     DriverState,
@@ -51,10 +48,6 @@ STATUS_HOLDS_NS = 500_000_000
 _FOLLOW_TASK = FollowTask()
 
 
-def unannounced(_now_ns: int, _wheels: Sequence[WheelSample]) -> None:
-    """Nobody hears the wheels before the record of their tick."""
-
-
 class CoreTick(msgspec.Struct, frozen=True, gc=False):
     """Result of one tick: the supervisor's verdict, the pipeline's work, the command sent (None if none was).
 
@@ -66,11 +59,6 @@ class CoreTick(msgspec.Struct, frozen=True, gc=False):
     command: WheelCommand | None
     events: tuple[str, ...]
     readings: Readings = Readings()
-
-    @property
-    def replies(self) -> tuple[Reply, ...]:
-        """Answers to this tick's requests."""
-        return self.output.replies
 
 
 class DaemonCore:
@@ -88,21 +76,19 @@ class DaemonCore:
         pipeline: Pipeline,
         recorder: Recorder,
         preflight: Callable[[Driver], tuple[str, ...]],
-        adaptation: GeometryAdaptation | None = None,
-        pose_source: PoseSource | None = None,
-        obstacle_source: UdpObstacles | None = None,
+        adaptation: GeometryAdaptation,
+        pose_source: PoseSource,
+        obstacle_source: UdpObstacles | None,
     ) -> None:
         self.config = config
         self.transport = transport
         self.driver = driver
-        self.pose_source = pose_source or RobotPoses()
+        self.pose_source = pose_source
         self.obstacle_source = obstacle_source
         self.pipeline = pipeline
-        guard = pipeline.guard
-        self.area = None if guard is None else SafeArea(guard, config.fence, config.robot.footprint)
-        """Fence and obstacles; None for a pipeline without a guard."""
+        self.area = SafeArea(pipeline.guard, config.fence, config.robot.footprint)
         self.recorder = recorder
-        self.adaptation = adaptation or NoAdaptation()
+        self.adaptation = adaptation
         self._plausibility = Plausibility()
         kind = find_driver(config.link.driver)
         card = kind.safety_card(config.link.settings())
@@ -118,7 +104,7 @@ class DaemonCore:
         self.last: CoreTick | None = None
         self.recording_fault = ""
         """Why nothing is recorded although it should be, kept up to date by whoever looks after the recorder."""
-        self.announce: Callable[[int, Sequence[WheelSample]], None] = unannounced
+        self.announce: Callable[[int, Sequence[WheelSample]], None] = lambda _now_ns, _wheels: None
         """Hears the wheels of a tick before it is planned, for whoever cannot wait for its record; must not block."""
         self._jumps = PoseJumps()
         self._jump = ""
@@ -131,7 +117,7 @@ class DaemonCore:
         self._generation = 0
         self._link_up = False
         self._planner_events = PlannerEvents(config.control.fallback)
-        self._state = supervisor.state
+        self.state = supervisor.state
         self._last_reported: tuple[str, bool, bool] | None = None
         self.entered: dict[str, int] = {}
         self._task_changed = False
@@ -139,8 +125,8 @@ class DaemonCore:
     @property
     def plausibility(self) -> PlausibilityStats:
         """A snapshot of what was counted of wheels, supply and poses."""
-        counted = self._plausibility.stats
-        return dataclasses.replace(counted, wheels_not_following=self._wheel_faults.not_following)
+        counted = self._plausibility
+        return PlausibilityStats(self._wheel_faults.not_following, counted.supply_dips, counted.poses_frozen)
 
     def set_task(self, task: RobotTask) -> None:
         """Follow another task of the same kind from the next tick on, in which it is recorded."""
@@ -180,12 +166,11 @@ class DaemonCore:
         overridden = self._begin_fence(now_ns, by_hand)
         result = self.pipeline.step(now_ns, believed, _motion(output, motion), mark, overridden)
         self._jump = self._jumps.step(result.estimate, result.pose_updates)
-        fence_events, fence_records = ((), []) if self.area is None else self.area.end(now_ns, result.fence, overridden)
+        fence_events, fence_records = self.area.end(now_ns, result.fence, overridden)
         command = self._command(output, result)
         sent = self._send(now_ns, output, command, silent=result.source is Source.SILENT)
         mark("send")
-        doubts = self._plausibility.step(now_ns, readings.wheels, readings.poses, readings.power)
-        doubts = (*self._wheel_faults.events, *doubts)
+        doubts = self._plausibility.step(readings.wheels, readings.poses, readings.power)
         self._watch_wiring(now_ns, believed, command)
         events = (
             *readings.events,
@@ -193,9 +178,11 @@ class DaemonCore:
             *output.events,
             *estimated.events,
             *self._planner_events.step(result.source, result.plan, result.planner_failure),
+            *self._wheel_faults.events,
             *doubts,
+            *fence_events,
+            *self._stays(now_ns, output, result),
         )
-        events = (*events, *fence_events, *self._stays(now_ns, output, result))
         self._follow_progress(output, result)
         self.recorder.put(
             now_ns,
@@ -242,9 +229,7 @@ class DaemonCore:
 
     def _begin_fence(self, now_ns: int, by_hand: bool) -> bool:
         """Take in what is reported of obstacles; returns whether a person drives in spite of the fence."""
-        if self.area is None:
-            return False
-        if self.area.guard.boundaries is not None and self.driver.limits is not None:
+        if self.driver.limits is not None:
             stops = self.driver.limits.stop_deceleration_rad_s2.value
             self.area.guard.set_deceleration(min(stops, self.config.robot.max_wheel_acceleration_rad_s2))
         for report in () if self.obstacle_source is None else self.obstacle_source.receive(now_ns):
@@ -304,7 +289,7 @@ class DaemonCore:
             by_hand=by_hand,
             poses_contradict=self.pipeline.fusion.sources.contradiction,
             pose_jump=self._jump,
-            fence_fault="" if self.area is None else self.area.task_fault,
+            fence_fault=self.area.task_fault,
         )
 
     def _to_learn_from(self, readings: Readings) -> Readings:
@@ -353,7 +338,7 @@ class DaemonCore:
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
         """Return the record of a change of state or of what is said of it, in the tick in which it happens."""
-        before, self._state = self._state, output.state
+        before, self.state = self.state, output.state
         last, self._last_reported = self._last_reported, (output.detail, output.running, output.estop)
         if output.state is before and self._last_reported == last:
             return []
@@ -426,17 +411,9 @@ class FindsWiring(Protocol):
 
 
 class TaskPilot:
-    """Leaves everything to the task and to the requests on the control socket."""
+    """Leaves everything to the task, which has no end of its own, and to the requests on the control socket."""
 
-    @property
-    def needs_pose(self) -> bool:
-        """A task cannot be followed without."""
-        return True
-
-    @property
-    def done(self) -> bool:
-        """The task has no end of its own."""
-        return False
+    needs_pose, done = True, False
 
     def step(self, now_ns: int, last: CoreTick | None) -> PilotTick:
         """Return a tick that follows the task and requests nothing."""

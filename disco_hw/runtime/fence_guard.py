@@ -15,7 +15,7 @@ from __future__ import annotations
 import enum
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -95,8 +95,9 @@ IDLE = FenceState(FenceVerdict.IDLE, 1.0, math.inf)
 class FenceGuard:
     """Decides in each tick which part of a command may be sent."""
 
-    def __init__(self, boundaries: Boundaries | None, settings: StoppingSettings, margin_m: float) -> None:
-        self._boundaries = boundaries
+    def __init__(self, boundaries: Boundaries, settings: StoppingSettings, margin_m: float) -> None:
+        self.boundaries = boundaries
+        """Boundaries that are kept away from."""
         self._settings = settings
         self._margin_m = margin_m
         self._obstacles: tuple[MovingCircle, ...] = ()
@@ -104,38 +105,23 @@ class FenceGuard:
         self._is_stopped = False
 
     @property
-    def boundaries(self) -> Boundaries | None:
-        """Boundaries that are kept away from; None without fence and footprint."""
-        return self._boundaries
-
-    @property
-    def settings(self) -> StoppingSettings:
-        """Settings of how the robot is assumed to stop."""
-        return self._settings
-
-    @property
     def is_active(self) -> bool:
         """Whether there is a fence or an obstacle."""
-        bounds = self._boundaries
-        return bounds is not None and (bounds.fence.is_set or bool(self._obstacles) or bool(self._missing))
+        return self.boundaries.fence.is_set or bool(self._obstacles) or bool(self._missing)
 
     def set_boundaries(self, boundaries: Boundaries, margin_m: float) -> None:
         """Keep within another fence from the next step on."""
         boundaries.set_obstacles(self._obstacles)
-        self._boundaries, self._margin_m = boundaries, margin_m
+        self.boundaries, self._margin_m = boundaries, margin_m
 
     def set_deceleration(self, deceleration_rad_s2: float) -> None:
         """Take the wheels to slow down so (rad/s^2), where the controller says less than robot.toml."""
-        settings = self._settings
-        self._settings = StoppingSettings(
-            settings.response_s, settings.reaction_s, deceleration_rad_s2, settings.period_s
-        )
+        self._settings = replace(self._settings, deceleration_rad_s2=deceleration_rad_s2)
 
     def set_obstacles(self, obstacles: Sequence[MovingCircle], missing: Sequence[str] = ()) -> None:
         """Keep away from these circles, true now; `missing`: names of those whose reports have ceased."""
         self._obstacles, self._missing = tuple(obstacles), tuple(missing)
-        if self._boundaries is not None:
-            self._boundaries.set_obstacles(self._obstacles)
+        self.boundaries.set_obstacles(self._obstacles)
 
     def step(
         self,
@@ -149,29 +135,22 @@ class FenceGuard:
 
         `overridden`: a person has asked to move in spite of the fence; nothing is scaled then.
         """
-        bounds = self._boundaries
-        if bounds is None or not self.is_active:
+        if not self.is_active:
             return IDLE
         if overridden:
             return FenceState(FenceVerdict.OVERRIDDEN, 1.0, math.nan, reason="manual driving with the fence overridden")
         if self._missing:
             names = ", ".join(self._missing)
-            return FenceState(
-                FenceVerdict.OBSTACLE_LOST, 0.0, math.nan,
-                reason=f"obstacle {names} is no longer reported; report it again or remove it",
-            )  # fmt: skip
+            text = f"obstacle {names} is no longer reported; report it again or remove it"
+            return FenceState(FenceVerdict.OBSTACLE_LOST, 0.0, math.nan, reason=text)
         if not estimate.ok or not _are_finite(estimate, geometry, last_sent):
-            return FenceState(
-                FenceVerdict.NO_POSE,
-                0.0,
-                math.nan,
-                reason="no valid pose while a fence is set; check the pose sensor",
-            )
+            text = "no valid pose while a fence is set; check the pose sensor"
+            return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason=text)
         is_motion_requested = max(map(abs, requested)) > STOPPED_RAD_S if all(map(math.isfinite, requested)) else False
         desired = requested if is_motion_requested else (0.0, 0.0)
         # A path that overflows has no clearance, which stops the robot: a warning would say nothing more.
         with np.errstate(over="ignore", invalid="ignore"):
-            poses, clearance, driven = self._stopping_paths(bounds, estimate, geometry, last_sent, desired)
+            poses, clearance, driven = self._stopping_paths(estimate, geometry, last_sent, desired)
         if not np.isfinite(clearance).all():
             return FenceState(FenceVerdict.NO_POSE, 0.0, math.nan, reason="the predicted stopping path is not finite")
         chosen = self._largest_scale(clearance, driven)
@@ -207,7 +186,6 @@ class FenceGuard:
 
     def _stopping_paths(
         self,
-        bounds: Boundaries,
         estimate: PoseEstimate,
         geometry: OdometryParameters,
         last_sent: tuple[float, float],
@@ -217,7 +195,8 @@ class FenceGuard:
 
         While the last command goes on the wheels turn as it says or as they are measured to, whichever path is nearer.
         """
-        spread, reach_m, count = _spread(geometry), bounds.footprint.reach_m, len(SCALES)
+        bounds, spread, count = self.boundaries, _spread(geometry), len(SCALES)
+        reach_m = bounds.footprint.reach_m
         measured = (estimate.left_speed_rad_s, estimate.right_speed_rad_s)
         found = [self._paths(estimate, geometry, one, requested, spread) for one in (last_sent, measured)]
         poses, driven, time_s = (np.concatenate(each) for each in zip(*found, strict=True))

@@ -13,7 +13,7 @@ import contextlib
 import math
 import socket
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import msgspec
@@ -22,6 +22,7 @@ from msgspec import Meta
 from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import MovingCircle
+from drivers.pose.udp import open_udp_port
 from drivers.samples import FARTHEST_M
 
 # Chosen: each takes time of the fence guard and the planner in every tick; further ones are refused.
@@ -69,9 +70,13 @@ def report_from(fields: Mapping[str, Any], age_limit_s: float = REPORTED_AGE_LIM
     except msgspec.ValidationError as error:
         example = "name=pillar x_m=0.5 y_m=0 radius_m=0.15"
         raise ObstacleRefused(f"obstacle: {str(error).replace('`', '')}; write it as {example}") from None
-    if not all(math.isfinite(value) for value in msgspec.structs.astuple(report) if isinstance(value, float)):
+    if not _is_finite(report):
         raise ObstacleRefused("obstacle: not a finite number; write finite values")
     return report
+
+
+def _is_finite(report: ObstacleReport) -> bool:
+    return all(math.isfinite(value) for value in msgspec.structs.astuple(report) if isinstance(value, float))
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,13 +100,10 @@ class Obstacles:
     def __init__(self) -> None:
         self._kept: dict[str, _Kept] = {}
         self._missing: frozenset[str] = frozenset()
-        self.refused = 0
-        """Number of reports that found no room."""
 
     def report(self, now_ns: int, report: ObstacleReport) -> None:
         """Take in a report, in place of an earlier one of the same name. Raises ObstacleRefused if there are 32."""
         if report.name not in self._kept and len(self._kept) >= MOST_OBSTACLES:
-            self.refused += 1
             raise ObstacleRefused(f"obstacle {report.name}: there are {MOST_OBSTACLES} already; remove one first")
         self._kept[report.name] = _Kept(report, now_ns - round(report.age_s * 1e9))
 
@@ -132,23 +134,16 @@ class Obstacles:
 
     def status(self, now_ns: int) -> list[dict[str, Any]]:
         """Return each obstacle's status: where it is now, and the age of its report."""
-        found = []
-        for name, one in sorted(self._kept.items()):
-            now = one.now(now_ns)
-            found.append(
-                {
-                    "name": name,
-                    "x_m": now.x_m,
-                    "y_m": now.y_m,
-                    "radius_m": now.radius_m,
-                    "vx_m_s": now.vx_m_s,
-                    "vy_m_s": now.vy_m_s,
-                    "age_s": one.age_s(now_ns),
-                    "age_limit_s": one.report.age_limit_s,
-                    "lost": name in self._missing,
-                }
-            )
-        return found
+        return [
+            {
+                "name": name,
+                **asdict(one.now(now_ns)),
+                "age_s": one.age_s(now_ns),
+                "age_limit_s": one.report.age_limit_s,
+                "lost": name in self._missing,
+            }
+            for name, one in sorted(self._kept.items())
+        ]
 
 
 _Content = ObstacleReport | list[ObstacleReport]
@@ -162,15 +157,11 @@ def obstacle_source_of(config: RobotConfig) -> UdpObstacles | None:
     if port is None:
         return None
     address = config.fence.obstacles_address
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setblocking(False)
     try:
-        opened.bind((address, port))
+        return UdpObstacles(open_udp_port(address, port))
     except OSError as error:
-        opened.close()
         why = error.strerror or str(error)
         raise InputError(f"robot.toml: fence.obstacles_port: {address}:{port}: {why}; choose another port") from None
-    return UdpObstacles(opened)
 
 
 class UdpObstacles:
@@ -178,17 +169,13 @@ class UdpObstacles:
 
     def __init__(self, opened: socket.socket) -> None:
         self._socket = opened
-        self.malformed = 0
-        """Number of datagrams that held no report."""
 
     def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
         """Return the obstacles reported since the last call, oldest first; never waits and never raises."""
         reports: list[ObstacleReport] = []
         with contextlib.suppress(OSError):
             for _ in range(_DATAGRAMS_A_TICK):
-                found = reports_in(self._socket.recv(_LONGEST_DATAGRAM))
-                self.malformed += not found
-                reports += found
+                reports += reports_in(self._socket.recv(_LONGEST_DATAGRAM))
         return reports
 
     def close(self) -> None:
@@ -204,5 +191,4 @@ def reports_in(datagram: bytes) -> list[ObstacleReport]:
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return []
     reports = read if isinstance(read, list) else [read]
-    numbers = (value for one in reports for value in msgspec.structs.astuple(one) if isinstance(value, float))
-    return reports[:MOST_OBSTACLES] if all(map(math.isfinite, numbers)) else []
+    return reports[:MOST_OBSTACLES] if all(map(_is_finite, reports)) else []

@@ -86,12 +86,6 @@ class Governor:
         self._largest_dt_s = _LARGEST_STEP_PERIODS * period_s
         self._left_rad_s = 0.0
         self._right_rad_s = 0.0
-        self._not_finite_count = 0
-
-    @property
-    def not_finite_count(self) -> int:
-        """Number of desired commands so far that held a NaN or an infinity."""
-        return self._not_finite_count
 
     def reset(self) -> None:
         """Start again from standstill; to be called when no command is being sent and the robot has stopped."""
@@ -101,16 +95,12 @@ class Governor:
     def step(self, desired_left_rad_s: float, desired_right_rad_s: float, dt_s: float) -> Governed:
         """Return the wheel speeds that the limits allow `dt_s` after the last command.
 
-        The desired speeds are scaled to the speed limit by a common factor. The result is the point on the line from
-        the last command to them that is as far as both wheels' accelerations allow.
-
         A desired command that is not finite counts as standstill. A `dt_s` that is negative or not a
         number counts as none, one beyond 1.5 nominal periods as 1.5 periods.
         """
         limited = Limited.NONE
         left, right = desired_left_rad_s, desired_right_rad_s
         if not (math.isfinite(left) and math.isfinite(right)):
-            self._not_finite_count += 1
             limited |= Limited.NOT_FINITE
             left, right = 0.0, 0.0
 
@@ -268,16 +258,15 @@ Motion = Off | Standstill | FollowTask | Manual | Silent
 class Tick(msgspec.Struct, frozen=True, gc=False):
     """Result of the pipeline for one tick.
 
-    `plan` is this tick's new plan or None, `plan_age_ns` the age of the one in force, `planner_failure` why there is no
-    new one; `requested` is what `source` wanted, `command` what the governor lets through (rad/s); `disturbance` what
-    was planned with, None where none is estimated; `fence` what the fence guard made of what was requested.
+    `plan` is this tick's new plan or None, `planner_failure` why there is none; `requested` is what `source` wanted,
+    `command` what the governor lets through (rad/s); `disturbance` what was planned with, None where none is estimated;
+    `fence` what the fence guard made of what was requested.
     """
 
     t_ns: int
     pose_updates: tuple[PoseUpdate, ...]
     estimate: PoseEstimate
     plan: WheelPlan | None
-    plan_age_ns: int | None
     planner_failure: str | None
     source: Source
     requested: tuple[float, float]
@@ -295,17 +284,17 @@ class Pipeline:
 
     A plan that is late or missing is followed on its tail for `plan_tail_s` after the tick it was made for; then the
     wheels ramp to zero. The governor runs in every tick, so that stopping obeys the acceleration limit as well.
+    `guard` checks every command.
     """
 
     def __init__(
-        self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float,
+        self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float, guard: FenceGuard,
         disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
         headings: HeadingWatch | None = None,
-        guard: FenceGuard | None = None,
     ) -> None:  # fmt: skip
-        self._guard = guard
+        self.guard = guard
         self._avoids = planner if isinstance(planner, AvoidsBoundaries) else None
-        self._fusion = fusion
+        self.fusion = fusion
         self.headings = headings or HeadingWatch([one.label for one in fusion.sources.all])
         self._means = means
         self._disturbance = disturbance
@@ -317,11 +306,6 @@ class Pipeline:
         self._following = False
         self._last_ns: int | None = None
         self._sent: deque[SentCommand] = deque()
-
-    @property
-    def fusion(self) -> PoseFusion:
-        """The estimator, for its counters."""
-        return self._fusion
 
     @property
     def disturbance(self) -> Disturbance:
@@ -345,9 +329,9 @@ class Pipeline:
         """
         self._planner.set_belief(belief)
         if self._disturbance is not None:
-            self._disturbance.change_geometry(self._fusion.parameters, odometry, self._fusion.wheels_rad_s)
-            self._fusion.set_disturbance(self._disturbance.value)
-        self._fusion.set_parameters(odometry)
+            self._disturbance.change_geometry(self.fusion.parameters, odometry, self.fusion.wheels_rad_s)
+            self.fusion.set_disturbance(self._disturbance.value)
+        self.fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:
         """Return the plan's `count` sampled rollouts of largest weight; None without a plan in force.
@@ -360,14 +344,14 @@ class Pipeline:
         """Leave out the headings that are no measurement; to be called once for the readings of each step."""
         if not readings.poses:
             return readings
-        geometry, difference_rad = self._fusion.parameters, self._fusion.wheel_difference_rad
+        geometry, difference_rad = self.fusion.parameters, self.fusion.wheel_difference_rad
         turn_per_rad = geometry.wheel_radius_m / geometry.axial_distance_m
         poses = []
         for sample in readings.poses:
             pose, never_measured = self.headings.screen(sample, difference_rad, turn_per_rad)
             poses.append(pose)
             if never_measured:
-                self._fusion.reset_heading()
+                self.fusion.reset_heading()
         return msgspec.structs.replace(readings, poses=tuple(poses))
 
     def step(
@@ -384,10 +368,10 @@ class Pipeline:
         without a valid control is reported in the tick.
         """
         for wheels in readings.wheels:
-            self._fusion.add_wheels(wheels)
+            self.fusion.add_wheels(wheels)
         updates = tuple(self._handle_pose(pose, now_ns) for pose in readings.poses)
-        self._fusion.sources.step(now_ns)
-        estimate = self._fusion.estimate(now_ns)
+        self.fusion.sources.step(now_ns)
+        estimate = self.fusion.estimate(now_ns)
         if self._means is not None and self._last_ns is not None:
             between_s = (now_ns - self._last_ns) * 1e-9
             self._means.add_wheels(estimate.left_speed_rad_s, estimate.right_speed_rad_s, between_s)
@@ -408,7 +392,6 @@ class Pipeline:
             pose_updates=updates,
             estimate=estimate,
             plan=plan,
-            plan_age_ns=None if self._plan is None else now_ns - self._plan_made_ns,
             planner_failure=failure,
             source=source,
             requested=requested,
@@ -421,26 +404,21 @@ class Pipeline:
         self, estimate: PoseEstimate, source: Source, requested: tuple[float, float], overridden: bool
     ) -> tuple[FenceState, tuple[float, float]]:
         """Return the fence guard's verdict on the requested wheel speeds, and the speeds (rad/s) that it allows."""
-        if self._guard is None or not self._guard.is_active or source in {Source.OFF, Source.SILENT}:
+        if source in {Source.OFF, Source.SILENT}:
             return IDLE, requested
         last = (self._sent[-1].left_rad_s, self._sent[-1].right_rad_s) if self._sent else (0.0, 0.0)
-        found = self._guard.step(estimate, self._fusion.parameters, last, requested, overridden)
+        found = self.guard.step(estimate, self.fusion.parameters, last, requested, overridden)
         if found.verdict in STOPS_MOTION:
             return found, (0.0, 0.0) if requested != (0.0, 0.0) else requested
         if found.scale == 1.0:
             return found, requested
         return found, (found.scale * requested[0], found.scale * requested[1])
 
-    @property
-    def guard(self) -> FenceGuard | None:
-        """Fence guard that checks every command; None where there is none."""
-        return self._guard
-
     def _handle_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
-        update = self._fusion.add_pose(pose, now_ns)
+        update = self.fusion.add_pose(pose, now_ns)
         if self._disturbance is not None:
-            self._disturbance.add_sample(pose, update, self._fusion.parameters, self._fusion.wheels_rad_s)
-            self._fusion.set_disturbance(self._disturbance.value)
+            self._disturbance.add_sample(pose, update, self.fusion.parameters, self.fusion.wheels_rad_s)
+            self.fusion.set_disturbance(self._disturbance.value)
         return update
 
     def _replan(self, now_ns: int, estimate: PoseEstimate) -> tuple[WheelPlan | None, str | None]:
@@ -459,8 +437,8 @@ class Pipeline:
             command_means=() if self._means is None else self._means.commands,
             body_means=() if self._means is None else self._means.body,
         )
-        if self._avoids is not None and self._guard is not None and self._guard.boundaries is not None:
-            self._avoids.look_around(self._guard.boundaries, corner_deviation_m(estimate, self._guard.boundaries))
+        if self._avoids is not None:
+            self._avoids.look_around(self.guard.boundaries, corner_deviation_m(estimate, self.guard.boundaries))
         try:
             plan = self._planner.plan(now_ns, state)
         except NoValidControl as error:

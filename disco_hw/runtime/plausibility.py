@@ -1,24 +1,20 @@
-"""Does the robot do what it should: supply holds, poses change, the task gets on, and wheels are wired as declared.
+"""Reports what is odd, and stops nothing: the supply dips, poses freeze or jump, the task or the planner is stuck.
 
-`Plausibility` and `Headway` stop nothing: they count and report what the rest of the stack tolerates, faults too short
-or too small for the firmware's own limits, before they grow. `Directions` looks at the first motion: are
-the wheels wired as robot.toml says? If not, the robot is stopped. Once that is known, no later fault is a matter of
-wiring, and `wheel_faults` says what it is. Their counts are compared with what was commanded,
-and the measured poses with what the counts predict: a wheel whose encoder and motor both turn the wrong way looks right
-to the first and not to the second.
+They are faults too short or too small for the firmware's own limits, which the rest of the stack tolerates: counted and
+said before they grow. Everything here is pure, one step a tick.
 """
 
 from __future__ import annotations
 
-import itertools
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from dataclasses import dataclass
 
-from drivers.motor import Wiring
-from drivers.types import PoseSample, PowerSample, WheelCommand, WheelSample
+from disco_hw.control.plan import WheelPlan
+from disco_hw.estimation import PoseEstimate
+from disco_hw.estimation.correction import PoseReason, PoseUpdate
+from disco_hw.runtime.pipeline import Source
+from drivers.types import PoseSample, PowerSample, WheelSample
 
 # Chosen: longer than a dip, so that it hardly moves the mean, and shorter than the emptying of a battery.
 SUPPLY_MEAN_S = 10.0
@@ -29,7 +25,6 @@ DIP_OVER_PART = 0.97
 REPEATS = 2
 # Chosen: slower wheels may leave a pose unchanged in its digits.
 MOVING_RAD_S = 0.3
-_SIDES = ("left", "right")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,30 +41,21 @@ class PlausibilityStats:
 
 
 class Plausibility:
-    """Compares what the robot reports with what it was commanded; pure, one step a tick.
+    """Watches supply and poses.
 
-    The supply dips by 6 % below its mean over 10 s, and has
-    recovered above 3 %. A pose that is repeated twice to the last digit is frozen.
+    The supply dips by 6 % below its mean over 10 s, and has recovered above 3 %. A pose that is repeated twice to the
+    last digit is frozen.
     """
 
     def __init__(self) -> None:
-        self._counts = asdict(PlausibilityStats())
+        self.supply_dips = self.poses_frozen = 0
         self._supply_v: float | None = None
         self._supply_ns = 0
         self._dipped = False
         self._poses: dict[int, tuple[tuple[float, float, float], int]] = {}
 
-    @property
-    def stats(self) -> PlausibilityStats:
-        """A snapshot of the counters."""
-        return PlausibilityStats(**self._counts)
-
     def step(
-        self,
-        now_ns: int,
-        wheels: Sequence[WheelSample],
-        poses: Sequence[PoseSample],
-        power: Sequence[PowerSample],
+        self, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], power: Sequence[PowerSample]
     ) -> tuple[str, ...]:
         """Take in a tick's samples; returns what began, in words."""
         return (*self._watch_supply(power), *self._watch_poses(poses, wheels))
@@ -83,7 +69,7 @@ class Plausibility:
             mean = volts if self._supply_v is None else self._supply_v
             if not self._dipped and volts < DIP_PART * mean:
                 self._dipped = True
-                self._counts["supply_dips"] += 1
+                self.supply_dips += 1
                 events.append(f"the supply voltage dropped from {mean:.1f} V to {volts:.1f} V")
             elif self._dipped and volts > DIP_OVER_PART * mean:
                 self._dipped = False
@@ -101,7 +87,7 @@ class Plausibility:
             repeats = repeats + 1 if pose == before and moving else 0
             self._poses[sample.source] = pose, repeats
             if repeats == REPEATS:
-                self._counts["poses_frozen"] += 1
+                self.poses_frozen += 1
                 events.append("the measured pose does not change while the wheels turn; check the pose sensor")
         return events
 
@@ -181,271 +167,106 @@ def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_f
     )
 
 
-EVALUATED_NS = 5_000_000_000
-"""Of motion: what turned the right way so long does so."""
-# Chosen: a slower command may turn no wheel, so it shows nothing of the wiring.
-MOVES_RAD_S = 0.3
-# Chosen: half of MOVES_RAD_S, so that the noise of a measured speed is no motion.
-STATIONARY_RAD_S = 0.15
-# Chosen: less than this against the command may be play or a push; more is a wheel that turns the wrong way.
-LEAST_RAD = 0.15
-# Chosen: of both wheels together; with less, noise decides which side turned more.
-LEAST_SUM_RAD = 0.4
-LEAST_PART = 0.1
-"""Of the other wheel's turning: one that turned by less stood, and shows nothing of which side it is on."""
-# Chosen: the same finding in so many ticks in a row, as one odd sample must not stop a robot.
-SAMPLES = 3
-# Chosen: part of the commanded turn, so that a long command needs more evidence than LEAST_RAD.
-_OPPOSITE_PART = 0.25
-# Chosen: crossed must fit well and straight badly, so that commands that are nearly equal decide nothing.
-_CROSSED_COSINE, _STRAIGHT_COSINE = 0.97, 0.93
-# Chosen: standard deviation, as part of the way, of what a robot moves otherwise than its wheels count.
-_SLIP_PART = 0.15
-# Chosen: part of the commanded turn; a wheel that counts less may have an encoder that fails.
-_COUNTED_PART = 0.25
-_UNKNOWN_PART = 0.2
-"""Of the way: a radius that is written down wrongly and slip that lasts, which every pose shows equally."""
-_ENOUGH, _MOST_OF_ONE = 10.0, 4.0
-"""Of log-likelihood against what robot.toml says, in all and by one pose."""
-# Chosen: under a quarter turn; the line between two poses says too little of a longer arc.
-_LARGEST_TURN_RAD = 1.5
-_MOVED_STD, _START_STD, _MOST_STARTS = 6.0, 2.0, 50
-"""Standard deviations of a pose at rest that are no motion, and of their mean; how many count."""
-_TURNED_PARTS = (0.4, 0.6, 0.8, 1.0)
-"""Of the turn of an ideal robot: a skid-steer turns less, by how much is what the model knows."""
-Pair = tuple[float, float]
+MISFITS = 3
+"""So many poses in a row outside the gate are reported; by chance that happens once in a billion poses."""
+FITS = 10
+"""So many that fit, one after the other, end that."""
 
 
-class _Start(NamedTuple):
-    """The mean of poses at rest, of one source."""
+class PoseJumps:
+    """Reports when the estimate of the pose has jumped, and when poses in a row do not fit what the wheels did."""
 
-    source: int
-    x_m: float
-    y_m: float
-    yaw_rad: float
-    poses: int
+    def __init__(self) -> None:
+        self._before: PoseEstimate | None = None
+        self._in_a_row = 0
+        self._is_mismatch = False
+        self._messages: list[str] = []
 
-    @staticmethod
-    def of(pose: PoseSample) -> _Start:
-        """Create the mean from its first pose."""
-        return _Start(pose.source, pose.x_m, pose.y_m, pose.yaw_rad, 1)
+    def step(self, estimate: PoseEstimate, updates: Sequence[PoseUpdate]) -> str:
+        """Return in words how the estimate has jumped since the tick before; empty if it followed the wheels."""
+        for update in updates:
+            self._count(update)
+        before, self._before = self._before, estimate
+        if before is None or estimate.reinitialisations == before.reinitialisations:
+            return ""
+        moved_m = math.hypot(estimate.x_m - before.x_m, estimate.y_m - before.y_m)
+        if not (before.heading_known and estimate.heading_known):
+            text = f"the pose jumped by {moved_m:.2f} m, and the heading is no longer known"
+        else:
+            turned_rad = abs(math.remainder(estimate.yaw_rad - before.yaw_rad, math.tau))
+            text = (
+                f"the pose jumped by {moved_m:.2f} m and {turned_rad:.2f} rad, which the motion of the wheels does "
+                "not explain"
+            )
+        self._messages.append(
+            f"{text}: the robot was carried or has slipped, or the measured poses are wrong; check the pose sensor"
+        )
+        return text
 
-    def with_pose(self, pose: PoseSample) -> _Start:
-        """Take in one more; another source, or a place that noise does not explain, begins again."""
-        yaw = math.remainder(pose.yaw_rad - self.yaw_rad, 2.0 * math.pi)
-        away_m = math.hypot(pose.x_m - self.x_m, pose.y_m - self.y_m)
-        moved = away_m > _MOVED_STD * pose.position_std_m or abs(yaw) > _MOVED_STD * pose.yaw_std_rad
-        if pose.source != self.source or moved:
-            return _Start.of(pose)
-        part = 1.0 / (self.poses + 1)
-        x_m, y_m = self.x_m + part * (pose.x_m - self.x_m), self.y_m + part * (pose.y_m - self.y_m)
-        return _Start(self.source, x_m, y_m, self.yaw_rad + part * yaw, min(self.poses + 1, _MOST_STARTS))
+    def new_messages(self) -> list[str]:
+        """Return sentences for the operator since the last call."""
+        messages, self._messages = self._messages, []
+        return messages
+
+    def _count(self, update: PoseUpdate) -> None:
+        if update.reason is PoseReason.GATED and update.innovation is not None:
+            self._in_a_row = min(self._in_a_row, 0) - 1
+            if self._in_a_row == -MISFITS and not self._is_mismatch:
+                self._is_mismatch = True
+                off_m = math.hypot(*update.innovation[:2])
+                self._messages.append(
+                    f"{MISFITS} poses in a row disagree with the wheels, by {off_m:.2f} m, and are not used; check "
+                    "the pose sensor"
+                )
+        elif update.accepted:
+            self._in_a_row = max(self._in_a_row, 0) + 1
+            self._is_mismatch = self._is_mismatch and self._in_a_row < FITS
 
 
-class Directions:
-    """Pure, one step a tick; `radius_m` and `track_m` are the nominal ones, `wiring` what robot.toml says of it.
+# Chosen: a smaller loss of speed is within what a robot's speed varies by anyway.
+LIMITED_PART = 0.95
+FOLLOWS = (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
+"""Sources of the command of a robot that follows its task."""
 
-    The wiring is judged once: after five seconds of motion without a finding it is known to be right.
+
+class PlannerEvents:
+    """Says once when the planner begins and ceases to fail, to fall back, or to plan from too few samples.
+
+    A speed that the wheels limit is reported once in a drive. `fallback` names the law that drives without a plan.
     """
 
-    def __init__(self, radius_m: float, track_m: float, wiring: Wiring) -> None:
-        self._radius_m, self._track_m, self._wiring = radius_m, track_m, wiring
-        self._turned: list[tuple[int, float, float]] = []
-        self._start: _Start | None = None
-        self._begun_ns: int | None = None
-        self._last_ns = 0
-        self._commanded: Pair = (0.0, 0.0)
-        self._before: Pair = (0.0, 0.0)
-        self._signs: tuple[float, ...] = (0.0, 0.0)
-        self._reversed = self._found = self.is_evaluated = False
-        self._in_a_row = ("", 0)
-        self._evidence: dict[tuple[bool, tuple[int, ...]], float] = {}
-        self._reset()
+    def __init__(self, fallback: str) -> None:
+        self._fallback = fallback
+        self._failing = self._collapsed = self._fell_back = self._is_limited = False
 
-    def step(
-        self,
-        now_ns: int,
-        wheels: Sequence[WheelSample],
-        poses: Sequence[PoseSample],
-        command: WheelCommand | None,
-        has_followed: tuple[bool, bool] = (False, False),
-        is_suspect: bool = False,
-    ) -> str | None:
-        """Take in a tick's samples and the command that it sends; returns once what is wrong and what to change.
-
-        `has_followed`: wheels that have counted as commanded before, which cannot be wired the other way round.
-        `is_suspect`: a wheel does not follow now, so that poses do not show how it is wired.
-        """
-        if command is None:
-            self._reset()
-            return None
-        self.is_evaluated = self.is_evaluated or (self._begun_ns is not None and now_ns - self._begun_ns > EVALUATED_NS)
-        if self._found or self.is_evaluated:
-            return None
-        for sample in wheels:
-            self._turned.append((sample.t_ns, sample.left_angle_rad, sample.right_angle_rad))
-        commanded = (command.left_rad_s, command.right_rad_s)
-        if self._begun_ns is None:
-            self._wait_for_motion(now_ns, wheels, poses, commanded)
-        else:
-            signs = [math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in commanded]
-            self._reversed = self._reversed or any(a * b < 0.0 for a, b in zip(signs, self._signs, strict=True))
-            self._signs = tuple(new or old for new, old in zip(signs, self._signs, strict=True))
-            step_s = (now_ns - self._last_ns) * 1e-9
-            self._commanded = (
-                self._commanded[0] + step_s * self._before[0],
-                self._commanded[1] + step_s * self._before[1],
+    def step(self, source: Source, plan: WheelPlan | None, failure: str | None) -> tuple[str, ...]:
+        """Return the events of a tick with this command's source, this new plan, or this failure to make one."""
+        events: list[str] = []
+        failing = failure is not None
+        if failing != self._failing:
+            events.append(f"planner: {failure}" if failing else "planner: recovered")
+        self._failing = failing
+        if source not in FOLLOWS:
+            self._is_limited = False
+        if plan is None:
+            return tuple(events)
+        found = plan.diagnostics
+        fell_back = source is Source.FALLBACK
+        if fell_back is not self._fell_back:
+            events.append(
+                f"planner: no valid plan; the fallback controller {self._fallback} follows the line instead"
+                if fell_back
+                else "planner: valid plan again; the planner drives"
             )
-            self._before, self._last_ns = commanded, now_ns
-            found = self._by_commands(wheels, has_followed) or (None if is_suspect else self._by_poses(poses))
-            self._found = found is not None
-            return found
-        return None
-
-    def _reset(self) -> None:
-        self._turned = []
-        self._start = None
-        self._begun_ns = None
-        self._last_ns = 0
-        self._commanded = (0.0, 0.0)
-        self._before = (0.0, 0.0)
-        self._signs = (0.0, 0.0)
-        self._reversed = self._found = False
-        self._in_a_row = ("", 0)
-        every = itertools.product((False, True), itertools.product((1, -1), repeat=2))
-        self._evidence = {wired: 0.0 for wired in every if wired != (False, (1, 1))}
-
-    def _wait_for_motion(
-        self, now_ns: int, wheels: Sequence[WheelSample], poses: Sequence[PoseSample], commanded: Pair
-    ) -> None:
-        """Update the mean pose at rest, and begin an observed motion once the robot is commanded to move from rest."""
-        for pose in poses:
-            if pose.has_heading:
-                self._start = _Start.of(pose) if self._start is None else self._start.with_pose(pose)
-        is_stationary = all(
-            max(abs(wheel.left_speed_rad_s), abs(wheel.right_speed_rad_s)) < STATIONARY_RAD_S for wheel in wheels[-1:]
-        )
-        if max(map(abs, commanded)) > MOVES_RAD_S and is_stationary and self._turned:
-            self._begun_ns = self._last_ns = now_ns
-            self._before = commanded
-            self._signs = tuple(math.copysign(1.0, speed) if abs(speed) > MOVES_RAD_S else 0.0 for speed in commanded)
-        del self._turned[:-1]
-
-    def _moved(self, t_ns: int) -> Pair:
-        """Return by how much (rad) the wheels have turned from the first kept sample to that time."""
-        at = max(bisect_right(self._turned, t_ns, key=lambda entry: entry[0]) - 1, 0)
-        _, left, right = self._turned[at]
-        return left - self._turned[0][1], right - self._turned[0][2]
-
-    def _by_commands(self, wheels: Sequence[WheelSample], has_followed: tuple[bool, bool]) -> str | None:
-        """Sides that turn against what was commanded, or as the other was."""
-        if not wheels or self._reversed:
-            return None
-        turned, commanded = self._moved(wheels[-1].t_ns), self._commanded
-        wrong = [
-            side
-            for side in (0, 1)
-            if not has_followed[side]
-            and turned[side] * math.copysign(1.0, commanded[side])
-            < -max(LEAST_RAD, _OPPOSITE_PART * abs(commanded[side]))
-        ]
-        crossed = (commanded[1], commanded[0])
-        enough = abs(turned[0]) + abs(turned[1]) > LEAST_SUM_RAD and min(map(abs, turned)) > LEAST_PART * max(
-            map(abs, turned)
-        )
-        if enough and _cosine(turned, crossed) > _CROSSED_COSINE and _cosine(turned, commanded) < _STRAIGHT_COSINE:
-            return self._again(self._describe_crossed())
-        return self._again(self._describe_opposite(wrong) if wrong else "")
-
-    def _by_poses(self, poses: Sequence[PoseSample]) -> str | None:
-        """Return the wiring, other than that of robot.toml, that explains the motion since rest; None if none does."""
-        start, declared = self._start, (False, (1, 1))
-        counted = self._moved(self._turned[-1][0])
-        if any(
-            abs(turn) < _COUNTED_PART * abs(commanded) for turn, commanded in zip(counted, self._commanded, strict=True)
-        ):
-            # A wheel that does not count says nothing of how it is wired.
-            return None
-        for pose in poses:
-            if start is None or not pose.has_heading or pose.source != start.source:
-                continue
-            turned = self._moved(pose.t_ns)
-            yaw = math.remainder(pose.yaw_rad - start.yaw_rad, 2.0 * math.pi)
-            if abs(yaw) > _LARGEST_TURN_RAD:
-                continue
-            along = start.yaw_rad + 0.5 * yaw
-            ahead_m = (pose.x_m - start.x_m) * math.cos(along) + (pose.y_m - start.y_m) * math.sin(along)
-            far_m = 0.5 * self._radius_m * (abs(turned[0]) + abs(turned[1]))
-            arc_std_m = 0.5 * self._track_m * pose.yaw_std_rad
-            variance = 2.0 * (pose.position_std_m**2 + arc_std_m**2) + (_SLIP_PART * far_m) ** 2
-            # All poses share the start's error, which may be no evidence.
-            start_m = _START_STD * math.hypot(pose.position_std_m, arc_std_m) / math.sqrt(start.poses)
-            off_declared = max(0.0, self._off_m(ahead_m, yaw, turned, *declared) - _UNKNOWN_PART * far_m - start_m)
-            for wired in self._evidence:
-                off = self._off_m(ahead_m, yaw, turned, *wired)
-                gain = 0.5 * (off_declared**2 - off**2) / max(variance, 1e-9)
-                self._evidence[wired] += min(max(gain, -_MOST_OF_ONE), _MOST_OF_ONE)
-        wired = max(self._evidence, key=self._evidence.__getitem__)
-        return self._describe_wiring(*wired) if self._evidence[wired] > _ENOUGH else None
-
-    def _off_m(self, ahead_m: float, yaw_rad: float, turned: Pair, swapped: bool, signs: Sequence[int]) -> float:
-        """Return the distance (m) of the pose from where wheels wired so lead; a turn counts as its arc at a wheel."""
-        left, right = reversed(turned) if swapped else turned
-        left, right = signs[0] * left, signs[1] * right
-        ahead = 0.5 * self._radius_m * (left + right)
-        arc = 0.5 * self._radius_m * (right - left)
-        turned_m = 0.5 * self._track_m * yaw_rad
-        return min(math.hypot(ahead_m - ahead, turned_m - part * arc) for part in _TURNED_PARTS)
-
-    def _again(self, text: str) -> str | None:
-        """Return the words once the same was found a few times in a row; no words mean that nothing was found."""
-        before, times = self._in_a_row
-        self._in_a_row = (text, times + 1 if text == before else 1)
-        return text if text and self._in_a_row[1] == SAMPLES else None
-
-    def _describe_opposite(self, wrong: Sequence[int]) -> str:
-        names = " and the ".join(f"{_SIDES[side]} wheel" for side in wrong)
-        encoder = list(self._wiring.encoder_direction)
-        motor = list(self._wiring.motor_direction)
-        for side in wrong:
-            encoder[side], motor[side] = -encoder[side], -motor[side]
-        return (
-            f"the {names} counted opposite to the command: in robot.toml write wheels.encoder_direction = {encoder} "
-            f"if it turned as commanded, or wheels.motor_direction = {motor} if it turned the other way"
-        )
-
-    def _describe_crossed(self) -> str:
-        crossed = str(not self._wiring.encoders_swapped).lower()
-        sides = str(not self._wiring.sides_swapped).lower()
-        return (
-            "each side counted what the other side was commanded: in robot.toml write wheels.encoders_swapped = "
-            f"{crossed}, and wheels.sides_swapped = {sides} as well if the robot turned the other way"
-        )
-
-    def _describe_wiring(self, swapped: bool, signs: Sequence[int]) -> str:
-        turned = self._moved(self._turned[-1][0])
-        backward = [side for side in (0, 1) if signs[side] < 0]
-        counted = [side for side in backward if not swapped and turned[side] * self._commanded[side] < 0.0]
-        motors, encoders = list(self._wiring.motor_direction), list(self._wiring.encoder_direction)
-        for side in backward:
-            encoders[side] = -encoders[side]
-            motors[side] = motors[side] if side in counted else -motors[side]
-        changes, texts = [], []
-        if swapped:
-            texts.append("left and right are swapped")
-            changes.append(f"wheels.sides_swapped = {str(not self._wiring.sides_swapped).lower()}")
-        for side in backward:
-            way = "counted opposite to its command but turned as commanded" if side in counted else "turns backward"
-            texts.append(f"the {_SIDES[side]} wheel {way}")
-        if motors != list(self._wiring.motor_direction):
-            changes.append(f"wheels.motor_direction = {motors}")
-        if encoders != list(self._wiring.encoder_direction):
-            changes.append(f"wheels.encoder_direction = {encoders}")
-        return (
-            f"the poses and the wheels show different motion: {', '.join(texts)}; in robot.toml write "
-            f"{' and '.join(changes)}, or correct [pose] if the frame of the poses is wrong"
-        )
-
-
-def _cosine(one: Pair, other: Pair) -> float:
-    return (one[0] * other[0] + one[1] * other[1]) / max(math.hypot(*one) * math.hypot(*other), 1e-9)
+        self._fell_back = fell_back
+        if found.collapsed != self._collapsed:
+            few = f"planner: plans rest on {found.ess:.1f} effective samples, too few to trust the plan"
+            events.append(few if found.collapsed else "planner: enough effective samples again")
+        self._collapsed = found.collapsed
+        if found.speed_part < LIMITED_PART and not self._is_limited:
+            self._is_limited = True
+            events.append(
+                f"planner: the speed is limited by the wheels to {found.speed_part:.0%} of the task's; "
+                "the robot follows its line more slowly"
+            )
+        return tuple(events)

@@ -75,11 +75,6 @@ class Check:
     text: str
 
 
-def failures(checks: Iterable[Check]) -> tuple[str, ...]:
-    """Return the texts of the checks that failed: what keeps the robot from being armed."""
-    return tuple(check.text for check in checks if check.level is Level.FAIL)
-
-
 def check_link_load(link: Link, control: Control) -> Check:
     """Compare the load of the link by the driver's cyclic frames with a budget of 40 %."""
     frames = find_driver(link.driver).cyclic_frames(link.settings(), control.rate_hz, link.key_file is not None)
@@ -100,21 +95,40 @@ def check_link_load(link: Link, control: Control) -> Check:
 
 
 def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
-    """Compare robot.toml's limits and encoder with the controller's; FAIL for each difference, else one OK."""
-    errors = check_limits(limits, robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2, robot.ticks_per_rev)
-    if errors:
-        return [Check("firmware limits", Level.FAIL, error) for error in errors]
-    speed, acceleration, ticks = (
-        limits.max_wheel_speed_rad_s,
-        limits.max_wheel_acceleration_rad_s2,
-        limits.ticks_per_rev,
-    )
-    found = [f"{robot.max_wheel_speed_rad_s:g} rad/s of at most {speed.value:g}, {SOURCE_TEXTS[speed.said_by]}"]
-    if acceleration is not None:
-        configured, source = robot.max_wheel_acceleration_rad_s2, SOURCE_TEXTS[acceleration.said_by]
-        found.append(f"{configured:g} rad/s^2 of at most {acceleration.value:g}, {source}")
+    """Compare robot.toml's limits and encoder with the controller's; FAIL for each that does not fit, else one OK.
+
+    A limit is to be refused at the start, not clipped in silence: a host that plans with more than the robot does
+    plans wrongly. Equal within the resolution on the wire (0.002 rad/s, 0.01 rad/s^2) is within.
+    """
+    errors, found = [], []
+    for name, unit, limit, resolution in (
+        ("max_wheel_speed_rad_s", "rad/s", limits.max_wheel_speed_rad_s, _SPEED_RESOLUTION_RAD_S),
+        (
+            "max_wheel_acceleration_rad_s2",
+            "rad/s^2",
+            limits.max_wheel_acceleration_rad_s2,
+            _ACCELERATION_RESOLUTION_RAD_S2,
+        ),
+    ):
+        if limit is None:
+            continue
+        value, source = getattr(robot, name), SOURCE_TEXTS[limit.said_by]
+        found.append(f"{value:g} {unit} of at most {limit.value:g}, {source}")
+        if not value <= limit.value + resolution:
+            errors.append(
+                f"robot.{name}: {value:g} is above the controller's limit, {source}; write at most {limit.value:g}, "
+                "or raise the controller's limit"
+            )
+    ticks = limits.ticks_per_rev
     if ticks is not None:
         found.append(f"{ticks.value:g} ticks a turn, {SOURCE_TEXTS[ticks.said_by]}")
+        if robot.ticks_per_rev != ticks.value:
+            errors.append(
+                f"robot.ticks_per_rev: {robot.ticks_per_rev:g} differs from the firmware's {ticks.value:g}; "
+                f"write {ticks.value:g}, or flash the firmware for this encoder"
+            )
+    if errors:
+        return [Check("firmware limits", Level.FAIL, error) for error in errors]
     return [Check("firmware limits", Level.OK, "; ".join(found))]
 
 
@@ -133,14 +147,8 @@ def check_fence(robot: Robot, fence: Fence) -> list[Check]:
     size = robot.footprint
     found = f"footprint {size.length:.2f} m x {size.width:.2f} m, {size.ahead:+.2f} m ahead of the tracked point"
     if robot.footprint_m is None:
-        return [
-            Check(
-                "fence",
-                Level.WARNING,
-                f"{found}, estimated from the wheels; measure the robot and write robot.footprint_m",
-            )
-        ]
-    return [Check("fence", Level.OK, found)]
+        found += ", estimated from the wheels; measure the robot and write robot.footprint_m"
+    return [Check("fence", Level.WARNING if robot.footprint_m is None else Level.OK, found)]
 
 
 def check_command_timing(control: Control, limits: Limits) -> Check:
@@ -239,39 +247,3 @@ def check_round_trip(round_trips_s: Sequence[float], period_s: float) -> Check:
     if worst_s >= period_s / 2:
         return Check(name, Level.WARNING, f"{found}; the worst is longer than half of {period}; {hint}")
     return Check(name, Level.OK, found)
-
-
-def check_limits(
-    limits: Limits,
-    max_wheel_speed_rad_s: float,
-    max_wheel_acceleration_rad_s2: float,
-    ticks_per_rev: float,
-) -> list[str]:
-    """Compare robot.toml's limits with the controller's; return a line for each that does not fit, none if all do.
-
-    A limit is to be refused at the start, not clipped in silence: a host that plans with more than the robot does
-    plans wrongly. Equal within the resolution on the wire (0.002 rad/s, 0.01 rad/s^2) is within.
-    """
-    errors = []
-    configured = (
-        ("max_wheel_speed_rad_s", max_wheel_speed_rad_s, limits.max_wheel_speed_rad_s, _SPEED_RESOLUTION_RAD_S),
-        (
-            "max_wheel_acceleration_rad_s2",
-            max_wheel_acceleration_rad_s2,
-            limits.max_wheel_acceleration_rad_s2,
-            _ACCELERATION_RESOLUTION_RAD_S2,
-        ),
-    )
-    for name, value, limit, resolution in configured:
-        if limit is not None and not value <= limit.value + resolution:
-            errors.append(
-                f"robot.{name}: {value:g} is above the controller's limit, {SOURCE_TEXTS[limit.said_by]}; write at "
-                f"most {limit.value:g}, or raise the controller's limit"
-            )
-    ticks = limits.ticks_per_rev
-    if ticks is not None and ticks_per_rev != ticks.value:
-        errors.append(
-            f"robot.ticks_per_rev: {ticks_per_rev:g} differs from the firmware's {ticks.value:g}; "
-            f"write {ticks.value:g}, or flash the firmware for this encoder"
-        )
-    return errors

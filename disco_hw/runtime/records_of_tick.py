@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from disco_hw.control import Rollouts
 from disco_hw.estimation.correction import PoseUpdate
@@ -117,8 +116,8 @@ def fan(t_ns: int, rollouts: Rollouts) -> records.Fan:
     """Return the rollouts of the plan made at `t_ns`, each thinned to 11 points from its first to its last."""
     steps = rollouts.trajectories.shape[1]
     kept = np.unique(np.linspace(0, steps - 1, min(_FAN_POINTS, steps)).astype(int))
-    places = np.round(rollouts.trajectories[:, kept, :2], _FAN_DIGITS)
-    return records.Fan(t_ns, _plain(rollouts.weights), _plain(places[:, :, 0].ravel()), _plain(places[:, :, 1].ravel()))
+    x, y = np.round(rollouts.trajectories[:, kept, :2], _FAN_DIGITS).reshape(-1, 2).T
+    return records.Fan(t_ns, tuple(rollouts.weights.tolist()), tuple(x.tolist()), tuple(y.tolist()))
 
 
 def _innovation(update: PoseUpdate) -> records.Record:
@@ -135,7 +134,3 @@ def _innovation(update: PoseUpdate) -> records.Record:
 @functools.cache
 def _names(limited: Limited) -> tuple[str, ...]:
     return tuple(flag.name or "" for flag in Limited if flag in limited)
-
-
-def _plain(values: NDArray[np.float64]) -> tuple[float, ...]:
-    return tuple(values.tolist())

@@ -186,14 +186,14 @@ class _ReplayedArea:
         self._overridden = False
         for entry in recorded:
             match entry.record:
-                case FenceChange() as changed if self._guard is not None:
+                case FenceChange() as changed:
                     fence = fence_of_record(changed)
                     self._guard.set_boundaries(Boundaries(self._footprint, fence), fence.margin_m)
                 case Obstacle(removed=True) as gone:
                     self._obstacles.remove(gone.name)
                 case Obstacle() as reported:
                     self._obstacles.report(reported.t_ns, report_of_record(reported))
-                case Controller() as answers if self._guard is not None:
+                case Controller() as answers:
                     limits = {**answers.told, **answers.fixed, **answers.declared}
                     stops = limits.get("stop_deceleration_rad_s2", self._fastest_rad_s2)
                     self._guard.set_deceleration(min(stops, self._fastest_rad_s2))
@@ -202,9 +202,8 @@ class _ReplayedArea:
 
     def begin(self, now_ns: int) -> bool:
         """Bring the guard up to a tick; returns whether the fence is overridden in it."""
-        if self._guard is not None:
-            self._obstacles.step(now_ns)
-            self._guard.set_obstacles(self._obstacles.circles(now_ns), self._obstacles.lost)
+        self._obstacles.step(now_ns)
+        self._guard.set_obstacles(self._obstacles.circles(now_ns), self._obstacles.lost)
         return self._overridden
 
 

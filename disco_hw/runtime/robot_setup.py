@@ -24,7 +24,7 @@ from disco_hw.files import MODEL_TOML as MODEL_KIND
 from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import MODEL_TOML, PATH_CSV, ROBOT_TOML, Attachment, TaskScene, attachment, records
 from disco_hw.model import Model, load_model
-from disco_hw.runtime import State
+from disco_hw.runtime import IN_USE, State
 from disco_hw.tasks import RobotTask, kind_of, task_from
 from drivers.private_files import KeyFileError, key_of_file
 
@@ -166,7 +166,6 @@ def setup_of_log(log: Log, hint: str) -> Setup:
 
 # Above any robot: what its own wheels can do is judged afterwards and says more.
 _FASTEST_M_S = 100.0
-_LOCKED = frozenset({State.ARMED, State.STOPPING})
 
 
 class TaskRefused(Exception):  # noqa: N818
@@ -179,7 +178,7 @@ def changed_task(task: RobotTask, requested: Mapping[str, Any], robot: Robot, st
     Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, and for a
     speed that the wheels cannot reach on the changed task.
     """
-    if state in _LOCKED:
+    if state in IN_USE:
         raise TaskRefused(
             f"the task can be changed only while the robot is disarmed (it is {state.name}); disarm first"
         )

@@ -10,7 +10,7 @@ import msgspec
 from disco_hw.fence import Fence, Footprint, fence_fault
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.log import records
-from disco_hw.runtime import State
+from disco_hw.runtime import IN_USE, State
 from disco_hw.runtime.fence_guard import IDLE, STOPS_MOTION, FenceGuard, FenceState, FenceVerdict
 from disco_hw.runtime.obstacles import ENTERED_AGE_LIMIT_S, ObstacleRefused, ObstacleReport, Obstacles, report_from
 
@@ -18,7 +18,6 @@ OVERRIDE_NS = 60_000_000_000
 """How long a manual override of the fence holds."""
 # Chosen: every fifth tick moves smoothly enough on the page, with a fifth of the records.
 _PATH_EVERY = 5
-_LOCKED = frozenset({State.ARMED, State.STOPPING})
 
 
 class FenceRefused(Exception):  # noqa: N818
@@ -127,7 +126,7 @@ class SafeArea:
 
         Raises FenceRefused while the robot is armed or stopping, and for a fence that is none.
         """
-        if state in _LOCKED:
+        if state in IN_USE:
             raise FenceRefused(
                 f"the fence can be changed only while the robot is disarmed (it is {state.name}); disarm first"
             )
@@ -174,5 +173,4 @@ def fence_of_record(record: records.FenceChange) -> Fence:
 
 def report_of_record(record: records.Obstacle) -> ObstacleReport:
     """Return the report that a record of an obstacle keeps."""
-    fields: dict[str, Any] = {name: getattr(record, name) for name in ObstacleReport.__struct_fields__}
-    return ObstacleReport(**fields)
+    return msgspec.convert(record, ObstacleReport, from_attributes=True)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from disco_hw.runtime import ARMING, PROBLEM, Condition, State, Transition, connection, next_transition
+from disco_hw.runtime import ARMING, PROBLEM, C, State, Transition, connection, next_transition
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 
@@ -16,28 +16,8 @@ FIND_HEADING = "the pose sensor measures none: drive one metre straight ahead by
 AFTER_A_JUMP = "check that the robot is where the page shows it, then start again"
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
-# Conditions as integers: flags cost a microsecond an operation in Python 3.11, and this runs in every tick.
-_LINK_UP = Condition.LINK_UP.value
-_LINK_RENEWED = Condition.LINK_RENEWED.value
-_ROBOT_TALKS = Condition.ROBOT_TALKS.value
-_ROBOT_IDLE = Condition.ROBOT_IDLE.value
-_ROBOT_ARMED = Condition.ROBOT_ARMED.value
-_ROBOT_MAY_MOVE = Condition.ROBOT_MAY_MOVE.value
-_ROBOT_REFUSED = Condition.ROBOT_REFUSED.value
-_ROBOT_FAULT = Condition.ROBOT_FAULT.value
-_ROBOT_ESTOP = Condition.ROBOT_ESTOP.value
-_TELEMETRY_FRESH = Condition.TELEMETRY_FRESH.value
-_TELEMETRY_LOST = Condition.TELEMETRY_LOST.value
-_WHEELS_STATIONARY = Condition.WHEELS_STATIONARY.value
-_ARM_PENDING = Condition.ARM_PENDING.value
-_DISARM_REQUESTED = Condition.DISARM_REQUESTED.value
-_ESTOP_REQUESTED = Condition.ESTOP_REQUESTED.value
-_RESET_PENDING = Condition.RESET_PENDING.value
-_PREFLIGHT_ERROR = Condition.PREFLIGHT_ERROR.value
-_DAEMON_ERROR = Condition.DAEMON_ERROR.value
-_ROBOT_HAS_FAULT = _ROBOT_ESTOP | _ROBOT_FAULT | _ROBOT_REFUSED
-_MOVABLE = _TELEMETRY_FRESH | _ROBOT_ARMED
-_PROBLEM = PROBLEM.value
+_ROBOT_HAS_FAULT = C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED
+_MOVABLE = C.TELEMETRY_FRESH | C.ROBOT_ARMED
 
 
 class UserRequest(enum.Enum):
@@ -50,6 +30,9 @@ class UserRequest(enum.Enum):
     DISARM = "disarm"
     ESTOP = "estop"
     RESET = "reset"
+
+
+_TOWARDS_MOTION = frozenset({UserRequest.ARM, UserRequest.ARM_UNRECORDED, UserRequest.START, UserRequest.RESET})
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +56,9 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     """Inputs of the supervisor in one tick.
 
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
-    magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors` and
-    `daemon_error` are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the
-    task is left to drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
+    magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors`
+    are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the task is left to
+    drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
     being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
     in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty. `fence_fault`:
@@ -91,7 +74,6 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     pose_ok: bool
     link_error: str | None = None
     preflight_errors: tuple[str, ...] = ()
-    daemon_error: str | None = None
     requests: tuple[UserRequest, ...] = ()
     task_finished: bool = False
     recording_fault: str = ""
@@ -177,7 +159,7 @@ class Supervisor:
         row = next_transition(before, seen | self._requested_conditions())
         if row is not None:
             self._enter(row, inputs)
-        if self._state is State.FAULT and _PROBLEM & (seen | self._requested_conditions()):
+        if self._state is State.FAULT and PROBLEM & (seen | self._requested_conditions()):
             self._fault_reason = self._fault_text(inputs)
         if row is not None:
             text = f"{row.reason}: {self._fault_reason}" if row.target is State.FAULT else _reason(row, inputs)
@@ -191,14 +173,13 @@ class Supervisor:
         link_up = inputs.link_state is LinkState.UP
         seen = _CONDITIONS[inputs.driver_state] | _union(
             (
-                (_LINK_UP, link_up),
-                (_LINK_RENEWED, link_up and inputs.link_generation != self._generation),
+                (C.LINK_UP, link_up),
+                (C.LINK_RENEWED, link_up and inputs.link_generation != self._generation),
                 # Written so that an age or a speed that is not a number counts as no telemetry and as moving.
-                (_TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
-                (_TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
-                (_WHEELS_STATIONARY, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
-                (_PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
-                (_DAEMON_ERROR, inputs.daemon_error is not None),
+                (C.TELEMETRY_FRESH, age_s is not None and age_s <= self._settings.telemetry_zero_s),
+                (C.TELEMETRY_LOST, age_s is None or not age_s <= self._settings.telemetry_disarm_s),
+                (C.WHEELS_STATIONARY, inputs.wheel_speed_rad_s < self._settings.still_rad_s),
+                (C.PREFLIGHT_ERROR, bool(inputs.preflight_errors)),
             )
         )
         if link_up:
@@ -209,22 +190,24 @@ class Supervisor:
         """Return the conditions that requests have set."""
         return _union(
             (
-                (_ARM_PENDING, self._arming is not None),
-                (_DISARM_REQUESTED, self._disarm_requested),
-                (_ESTOP_REQUESTED, self._estop_requested),
-                (_RESET_PENDING, self._resetting is not None),
+                (C.ARM_PENDING, self._arming is not None),
+                (C.DISARM_REQUESTED, self._disarm_requested),
+                (C.ESTOP_REQUESTED, self._estop_requested),
+                (C.RESET_PENDING, self._resetting is not None),
             )
         )
 
     def _reply_to(self, now_ns: int, request: UserRequest, estop_now: bool, inputs: Inputs, seen: int) -> Reply:
         """Take up or refuse one request, in words; an e-stop beats all that could lead to motion in the same tick."""
+        if estop_now and request in _TOWARDS_MOTION:
+            return Reply(request, False, "an e-stop was requested at the same time")
         refusal: str | None = None
         text = ""
         match request:
             case UserRequest.ESTOP:
                 self._estop_requested, self._resetting = True, None
                 self._drop_pending("e-stop")
-                text = "e-stop" if seen & _LINK_UP else "e-stop requested; it is sent as soon as the link is up"
+                text = "e-stop" if seen & C.LINK_UP else "e-stop requested; it is sent as soon as the link is up"
             case UserRequest.DISARM:
                 self._disarm_requested = True
                 self._drop_pending("disarm")
@@ -233,19 +216,19 @@ class Supervisor:
                 text = "stopping the task" if self._running else "no task is running"
                 self._running = self._start_pending = False
             case UserRequest.ARM | UserRequest.ARM_UNRECORDED:
-                refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_arm(inputs, seen)
+                refusal = self._why_not_arm(inputs, seen)
                 if refusal is None and request is UserRequest.ARM and self._state is not State.ARMED:
                     refusal = inputs.recording_fault or None
                 if refusal is None and self._state is State.READY and self._arming is None:
                     self._arming = _Pending(now_ns)
                 text = "already armed" if self._state is State.ARMED else "arming"
             case UserRequest.START:
-                refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_start(inputs, seen)
+                refusal = self._why_not_start(inputs, seen)
                 if refusal is None and not (self._running or self._start_pending):
                     self._start_pending, self._by_hand = True, inputs.by_hand
                 text = "starting" if self._state is State.ARMED else "starting once armed"
             case UserRequest.RESET:
-                refusal = "an e-stop was requested at the same time" if estop_now else self._why_not_reset(inputs, seen)
+                refusal = self._why_not_reset(inputs, seen)
                 if refusal is None:
                     self._estop_requested, self._resetting = False, self._resetting or _Pending(now_ns)
                 text = "resetting"
@@ -255,9 +238,9 @@ class Supervisor:
         match self._state:
             case State.ARMED:
                 return None
-            case State.READY if not seen & _TELEMETRY_FRESH:
+            case State.READY if not seen & C.TELEMETRY_FRESH:
                 return "no recent wheel data from the robot; check the cable and the encoders"
-            case State.READY if not seen & _WHEELS_STATIONARY:
+            case State.READY if not seen & C.WHEELS_STATIONARY:
                 return "the wheels are turning; wait until they stand still"
             case State.READY:
                 return None
@@ -271,7 +254,7 @@ class Supervisor:
     def _why_not_start(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.ARMED and self._arming is None:
             return "the robot is not armed; arm it first"
-        if self._state is State.ARMED and not seen & _TELEMETRY_FRESH:
+        if self._state is State.ARMED and not seen & C.TELEMETRY_FRESH:
             return "no recent wheel data from the robot; check the cable and the encoders"
         return self._pose_fault(inputs)
 
@@ -292,11 +275,9 @@ class Supervisor:
     def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
         if self._state is not State.FAULT:
             return f"nothing to reset in state {self._state.value}"
-        if inputs.daemon_error is not None:
-            return f"the daemon failed ({inputs.daemon_error}); restart it"
         if inputs.preflight_errors:
             return f"{inputs.preflight_errors[0]}; correct it and restart the daemon"
-        if self._estop_requested and not seen & _ROBOT_ESTOP:
+        if self._estop_requested and not seen & C.ROBOT_ESTOP:
             return "the robot has not confirmed the e-stop yet; wait, then reset again"
         return None
 
@@ -305,7 +286,7 @@ class Supervisor:
         arming, resetting = self._arming, self._resetting
         if arming is not None:
             arming.begun = arming.begun or inputs.driver_state is DriverState.ARMING
-            if arming.begun and seen & _ROBOT_IDLE:
+            if arming.begun and seen & C.ROBOT_IDLE:
                 self._drop_pending(f"the robot did not arm: {inputs.driver_detail}")
             elif now_ns - arming.since_ns > self._settings.arming_timeout_s * 1e9:
                 self._drop_pending(
@@ -375,8 +356,6 @@ class Supervisor:
 
     def _fault_text(self, inputs: Inputs) -> str:
         """Return what a person should know of the present state."""
-        if inputs.daemon_error is not None:
-            return inputs.daemon_error
         if inputs.link_state is LinkState.UP and self._state is State.FAULT:
             if inputs.preflight_errors:
                 return "; ".join(inputs.preflight_errors)
@@ -399,7 +378,7 @@ class Supervisor:
                 if self._arming is None and self._settings.heading_required and inputs.heading_missing:
                     return f"heading not known; {FIND_HEADING}"
                 return ARMING if self._arming is not None else "ready to be armed"
-            case State.ARMED if not seen & _TELEMETRY_FRESH:
+            case State.ARMED if not seen & C.TELEMETRY_FRESH:
                 return "no recent wheel data from the robot: commanding zero speed"
             case State.ARMED:
                 return "running the task" if self._running else "armed, commanding zero speed"
@@ -416,7 +395,7 @@ class Supervisor:
         motion_allowed = armed and self._running and may_move
         stopping = self._state in (State.STOPPING, State.FAULT)
         # With telemetry lost nothing is sent any more: the robot's own watchdog then stops it by a second way.
-        braking = stopping and seen & (_ROBOT_ARMED | _TELEMETRY_LOST) == _ROBOT_ARMED
+        braking = stopping and seen & (C.ROBOT_ARMED | C.TELEMETRY_LOST) == C.ROBOT_ARMED
         return Output(
             state=self._state,
             detail=self._detail(inputs, seen),
@@ -424,8 +403,8 @@ class Supervisor:
             motion_allowed=motion_allowed,
             zero_only=(armed and not motion_allowed) or braking,
             running=self._running,
-            send_estop=self._estop_requested and seen & (_LINK_UP | _ROBOT_ESTOP) == _LINK_UP,
-            estop=self._estop_requested or bool(seen & _ROBOT_ESTOP),
+            send_estop=self._estop_requested and seen & (C.LINK_UP | C.ROBOT_ESTOP) == C.LINK_UP,
+            estop=self._estop_requested or bool(seen & C.ROBOT_ESTOP),
             events=tuple(self._events),
             replies=replies,
         )
@@ -443,7 +422,7 @@ class Supervisor:
 
 def _reason(row: Transition, inputs: Inputs) -> str:
     """Return the row's reason; where the robot acted first, with what the driver knows of its reason."""
-    return f"{row.reason}: {inputs.driver_detail}" if Condition.ROBOT_ARMED in row.blocked_by else row.reason
+    return f"{row.reason}: {inputs.driver_detail}" if C.ROBOT_ARMED & row.blocked_by else row.reason
 
 
 def _first_request(pending: _Pending, request: Request) -> Request | None:
@@ -462,13 +441,13 @@ def _condition_of(robot: DriverState) -> int:
     """Return the conditions that the driver's state alone decides."""
     return _union(
         (
-            (_ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),
-            (_ROBOT_IDLE, robot in _IDLE),
-            (_ROBOT_ARMED, robot is DriverState.ARMED),
-            (_ROBOT_MAY_MOVE, robot in _MAY_MOVE),
-            (_ROBOT_REFUSED, robot is DriverState.REFUSED),
-            (_ROBOT_FAULT, robot is DriverState.FAULT),
-            (_ROBOT_ESTOP, robot is DriverState.ESTOP),
+            (C.ROBOT_TALKS, robot in _IDLE | _MAY_MOVE),
+            (C.ROBOT_IDLE, robot in _IDLE),
+            (C.ROBOT_ARMED, robot is DriverState.ARMED),
+            (C.ROBOT_MAY_MOVE, robot in _MAY_MOVE),
+            (C.ROBOT_REFUSED, robot is DriverState.REFUSED),
+            (C.ROBOT_FAULT, robot is DriverState.FAULT),
+            (C.ROBOT_ESTOP, robot is DriverState.ESTOP),
         )
     )
 

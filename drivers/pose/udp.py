@@ -54,6 +54,18 @@ _DECODERS: tuple[Callable[[bytes], _Datagram], ...] = (
 )
 
 
+def open_udp_port(address: str, port: int) -> socket.socket:
+    """Return a UDP socket for the control loop, which receives on this port and never waits. Raises OSError."""
+    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    opened.setblocking(False)
+    try:
+        opened.bind((address, port))
+    except OSError:
+        opened.close()
+        raise
+    return opened
+
+
 def create_pose_source(
     *,
     address: str = "127.0.0.1",
@@ -70,12 +82,9 @@ def create_pose_source(
     """
     if key_file and key is None:
         raise PoseSourceError(f"the key of {key_file} was not read; poses without authentication would be accepted")
-    opened = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    opened.setblocking(False)
     try:
-        opened.bind((address, port))
+        opened = open_udp_port(address, port)
     except OSError as error:
-        opened.close()
         reason = error.strerror or str(error)
         raise PoseSourceError(f"{address}:{port}: {reason}; choose another pose.port, or pose.address") from None
     proof = None if key is None else PoseProof(key, time.time_ns())

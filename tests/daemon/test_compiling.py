@@ -117,11 +117,11 @@ def test_what_a_start_will_need_is_compiled_beforehand_with_words_and_nothing_fo
 ):
     made, messages = [], []
 
-    def create(config, model):
-        made.append([effect.name for effect in model.effects])
+    def create(setup, _law):
+        made.append([effect.name for effect in setup.model.effects])
         njit(lambda x: x + 1.0)(2.0)
 
-    monkeypatch.setattr(run, "create_planner", create)
+    monkeypatch.setattr(run, "planner_of", create)
     monkeypatch.setattr(run, "create_pipeline", lambda *_: None)
     monkeypatch.setattr(run, "warm_up", lambda _: None)
     shipped = load_model(SHIPPED_ROBOT.parent / "wombot_model.toml")

@@ -6,8 +6,8 @@ import msgspec
 import pytest
 
 from disco_hw.daemon import default_socket_path
-from disco_hw.daemon.run import DaemonOptions, _log_path, run_daemon
-from disco_hw.drive.drive_command import DriveOptions, _new_log, run_drive
+from disco_hw.daemon.run import DaemonOptions, new_log, run_daemon
+from disco_hw.drive.drive_command import DriveOptions, run_drive
 from disco_hw.errors import InputError
 from tests.inference.drives import robot_config
 
@@ -22,7 +22,7 @@ def test_no_name_of_a_robot_leaves_the_directory(name, tmp_path):
         robot=msgspec.structs.replace(config.robot, name=name),
         log=msgspec.structs.replace(config.log, directory=str(tmp_path)),
     )
-    for path in (_log_path(config, None), _new_log(config)):
+    for path in (new_log(config), new_log(config, "drive-")):
         assert path.parent == tmp_path
         path.write_bytes(b"")
         assert path.resolve().parent == tmp_path.resolve()

@@ -208,7 +208,7 @@ def test_a_path_that_cannot_be_used_is_reported_in_one_line(tmp_path):
 
 def test_the_recorder_gets_everything_first(feed):
     memory = MemoryRecorder()
-    both = WatchedRecorder(memory, feed)
+    both = WatchedRecorder(memory, feed, feed)
     now_ns, got = tick_records(0)
     both.put(now_ns, got)
     both.put(now_ns + PERIOD_NS, got)

@@ -41,11 +41,6 @@ def test_messages_arrive_over_path_and_abstract_sockets(manager):
     notifier.status("ARMED:\ncommanding zero speed")
     notifier.stopping()
     assert received(listener) == ["READY=1", "STATUS=ARMED: commanding zero speed", "STOPPING=1"]
-    assert notifier.unsent == 0
-    notifier.close()
-    notifier.close()
-    notifier.ready()
-    assert received(listener) == []
 
 
 def test_the_watchdog_is_fed_at_half_its_interval(manager):
@@ -57,7 +52,6 @@ def test_the_watchdog_is_fed_at_half_its_interval(manager):
         if received(listener) == ["WATCHDOG=1"]:
             fed_at_s.append(tick / 50)
     assert fed_at_s == [0.0, 0.5, 1.0, 1.5, 2.0]
-    notifier.close()
 
 
 @pytest.mark.parametrize(
@@ -75,7 +69,6 @@ def test_no_watchdog_is_fed_that_is_off_or_another_process_s(manager, variables)
     notifier = Notifier({**environment, **variables})
     notifier.watchdog(0)
     assert received(listener) == []
-    notifier.close()
 
 
 @pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1"}])
@@ -83,22 +76,16 @@ def test_without_a_service_manager_nothing_happens(environment):
     notifier = Notifier(environment)
     notifier.ready()
     notifier.watchdog(0)
-    assert notifier.unsent == 0
 
 
-def test_a_manager_that_has_gone_or_does_not_read_is_counted_and_never_waited_for(tmp_path):
+def test_a_manager_that_has_gone_or_does_not_read_is_never_waited_for(tmp_path):
     environment = {"NOTIFY_SOCKET": str(tmp_path / "notify")}
-    gone = Notifier(environment)
-    gone.ready()
-    assert gone.unsent == 1
-    gone.close()
+    Notifier(environment).ready()
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
         listener.bind(environment["NOTIFY_SOCKET"])
         deaf = Notifier(environment)
         for _ in range(2000):
             deaf.status("x" * 500)
-        assert deaf.unsent > 0
-        deaf.close()
 
 
 def test_a_process_started_like_a_service_reports_ready(tmp_path):

@@ -12,6 +12,9 @@ from disco_hw.control import NoValidControl
 from disco_hw.daemon.run import warm_up
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.fence import Fence, Footprint
+from disco_hw.fence.clearance import Boundaries
+from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
 from disco_hw.runtime.pipeline import Governor, Pipeline, WheelLimits
 from tests.tables import thinned
 
@@ -34,7 +37,8 @@ def test_poses_are_accepted_gated_and_refused_and_the_planner_is_asked():
     planner = Refusing()
     fusion = PoseFusion(Estimation(), OdometryParameters(0.06, 0.4, 0.2), 0.05)
     governor = Governor(WheelLimits(8.0, 20.0, 20.0), 0.02)
-    warm_up(Pipeline(fusion, planner, governor, 0.2))
+    guard = FenceGuard(Boundaries(Footprint(0.5, 0.4, 0.1), Fence()), StoppingSettings(0.05, 0.1, 20.0, 0.02), 0.05)
+    warm_up(Pipeline(fusion, planner, governor, 0.2, guard))
     assert planner.calls > 20
     assert fusion.stats.poses_accepted > 20
     assert fusion.stats.poses_gated == 1

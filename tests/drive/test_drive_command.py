@@ -52,7 +52,7 @@ def test_nobody_drives_a_robot_that_may_be_real_unattended(tmp_path, interface, 
 
 def test_without_a_terminal_one_line_says_what_to_use(tmp_path, monkeypatch):
     with (tmp_path / "nothing").open("w+b") as file:
-        monkeypatch.setattr("disco_hw.drive.drive_command._STANDARD_INPUT", file.fileno())
+        monkeypatch.setattr("disco_hw.drive.drive_command.STANDARD_INPUT", file.fileno())
         with pytest.raises(InputError, match="not a terminal; use a terminal, --gamepad or --script with --unattended"):
             run_drive(DriveOptions(write_robot_file(tmp_path)))
 
@@ -69,7 +69,7 @@ def test_the_terminal_is_put_back_when_the_daemon_cannot_start(tmp_path, monkeyp
 
     master, slave = os.openpty()
     before = termios.tcgetattr(slave)
-    monkeypatch.setattr("disco_hw.drive.drive_command._STANDARD_INPUT", slave)
+    monkeypatch.setattr("disco_hw.drive.drive_command.STANDARD_INPUT", slave)
     robot = write_robot_file(tmp_path)
     (tmp_path / "control.sock").write_text("in the way")
     with pytest.raises(InputError, match="not a socket"):

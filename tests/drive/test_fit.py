@@ -10,15 +10,16 @@ import pytest
 
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput, RobotView
-from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, ScriptGeometry, driven_path, fit_script
+from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, driven_path, fit_script
 from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource
 from disco_hw.drive.scripts import create_script
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import load_setup
 
-ROBOT = ScriptGeometry(0.06, 0.4, 0.1)
+ROBOT = OdometryParameters(0.06, 0.4, 0.1)
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM_NEEDED = Room((-0.5, 2.5), (-1.0, 1.0))
 CENTER = (0.0, 0.0, 0.0)
@@ -130,7 +131,7 @@ class AlwaysPressed:
         pass
 
 
-def drive(source: FittedScriptSource, robot: ScriptGeometry, bounds: Boundaries) -> float:
+def drive(source: FittedScriptSource, robot: OdometryParameters, bounds: Boundaries) -> float:
     """Let a robot with another geometry obey until the source ends; returns its least clearance (m)."""
     pose, deadman, least = CENTER, False, math.inf
     for tick in range(20_000):
@@ -148,7 +149,7 @@ def drive(source: FittedScriptSource, robot: ScriptGeometry, bounds: Boundaries)
 
 def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leaves_the_fence():
     fence = Fence(keep_in=((-1.5, -1.5), (1.5, -1.5), (1.5, 1.5), (-1.5, 1.5)))
-    bounds, other = Boundaries(FOOTPRINT, fence), ScriptGeometry(0.068, 0.36, 0.1)
+    bounds, other = Boundaries(FOOTPRINT, fence), OdometryParameters(0.068, 0.36, 0.1)
     script = shipped("steps")
     pose, planned = CENTER, math.inf
     for manoeuvre in fitted(script, fence).manoeuvres:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from disco_hw.drive import GamepadSource, RobotView
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.runtime import State
+from disco_hw.runtime.pipeline import Manual, Standstill
 from drivers.gamepad import GamepadError, GamepadState
 
 MS = 1_000_000
@@ -92,18 +93,15 @@ def test_a_pad_that_comes_back_held_arms_nothing_by_itself():
         return deadman.step(bench.now_ns, newest, robot_state)
 
     step(GamepadState(0, 0.0, 0.0, False), State.READY)
-    step(GamepadState(0, 1.0, 0.0, True), State.READY)
-    assert deadman.engaged
+    assert isinstance(step(GamepadState(0, 1.0, 0.0, True), State.READY).motion, Manual)
     bench.pad.state = None
-    step(None, State.ARMED)
-    assert not deadman.engaged
+    assert isinstance(step(None, State.ARMED).motion, Standstill)
     bench.on_return = GamepadState(0, 1.0, 0.0, True)
     for _ in range(100):
         assert step(None, State.READY).requests == ()
     assert bench.opened == 1
     step(GamepadState(bench.now_ns, 1.0, 0.0, False), State.READY)
-    step(GamepadState(bench.now_ns, 1.0, 0.0, True), State.READY)
-    assert deadman.engaged
+    assert isinstance(step(GamepadState(bench.now_ns, 1.0, 0.0, True), State.READY).motion, Manual)
 
 
 def test_closing_closes_the_pad():

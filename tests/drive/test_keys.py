@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.drive.terminal import DIRECTIONS, KeyEvent, KeyHold, parse, wheel_speeds
+from disco_hw.drive.terminal import DIRECTIONS, KeyHold, parse, wheel_speeds
 
 MS = 1_000_000
 UP, LEFT = b"\x1b[A", b"\x1b[D"
@@ -29,7 +29,7 @@ class Typist:
         return seen
 
     def press(self, key):
-        self.keys.press(KeyEvent(self.now_ns, key))
+        self.keys.press(self.now_ns, key)
 
     def hold(self, key, ms, delay_ms=180):
         self.press(key)

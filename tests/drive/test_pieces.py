@@ -29,4 +29,3 @@ def test_each_piece_is_followed_by_a_rest():
     assert [part.name for part in found] == ["one", "rest", "two", "rest"]
     assert [part.duration_s for part in found] == [1.0, REST_S, 3.0, REST_S]
     assert found[1].wheels(0.3) == (0.0, 0.0)
-    assert PIECES.rest(4.0).duration_s == 4.0

@@ -49,7 +49,7 @@ def bench():
 
 
 def replies(ticks):
-    return [reply for tick in ticks for reply in tick.replies]
+    return [reply for tick in ticks for reply in tick.output.replies]
 
 
 def test_by_hand_a_metre_and_then_the_task_is_armed_anew(bench):

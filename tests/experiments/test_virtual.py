@@ -10,7 +10,7 @@ from disco_hw.cli import app
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.errors import InputError
 from disco_hw.experiments import virtual, with_device
-from disco_hw.experiments.virtual import SimOptions, run_sim, true_parameters
+from disco_hw.experiments.virtual import run_sim, true_parameters
 from disco_hw.runtime.robot_setup import load_setup
 from tests.runtime.simulated import ROBOT_TEXT
 
@@ -31,11 +31,11 @@ def test_draws_have_the_posteriors_spread_parameter_by_parameter():
 def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
     played = []
     monkeypatch.setattr(virtual, "run_virtual_robot", played.append)
-    run_sim(SimOptions(SHIPPED_ROBOT))
+    run_sim(SHIPPED_ROBOT)
     (options,) = played
     assert options.plant == options.plant.with_ideal_motors()
     assert options.effects == {}
-    run_sim(SimOptions(SHIPPED_ROBOT, hide=("motor_lag=0.06",)))
+    run_sim(SHIPPED_ROBOT, hide=("motor_lag=0.06",))
     assert played[1].plant == options.plant
     assert set(played[1].effects) == {"motor_lag"}
 
@@ -46,17 +46,17 @@ def test_the_plain_robot_is_the_one_that_its_model_describes(monkeypatch):
 )
 def test_a_mistake_in_what_to_hide_is_named(hide, expected_error):
     with pytest.raises(InputError, match=expected_error):
-        run_sim(SimOptions(SHIPPED_ROBOT, hide=(hide,)))
+        run_sim(SHIPPED_ROBOT, hide=(hide,))
 
 
 def test_a_fractional_encoder_is_refused(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_text(ROBOT_TEXT.replace("ticks_per_rev = 2048", "ticks_per_rev = 2796.8"))
     with pytest.raises(InputError, match="whole number"):
-        run_sim(SimOptions(path))
+        run_sim(path)
     # Checked before the encoder, so that this ends even where the start is not looked at.
     with pytest.raises(InputError, match=r"--start: nan 0\.0 0\.0 is not a pose"):
-        run_sim(SimOptions(path, start=(float("nan"), 0.0, 0.0)))
+        run_sim(path, start=(float("nan"), 0.0, 0.0))
 
 
 @pytest.mark.parametrize("what", ["effects", "faults"])
@@ -73,8 +73,8 @@ def test_a_robot_is_needed_to_run():
 
 def test_a_board_that_has_a_link_of_its_own_is_refused_what_the_simulators_link_does(tmp_path):
     with pytest.raises(InputError, match="--bus-log: cannot be used with --board"):
-        run_sim(SimOptions(SHIPPED_ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log"))
+        run_sim(SHIPPED_ROBOT, board="/dev/ttyUSB1", bus_log=tmp_path / "bus.log")
     vendors = tmp_path / "robot.toml"
     vendors.write_text(with_device(ROBOT_TEXT, "odrive"), "utf-8")
     with pytest.raises(InputError, match=r"--board: .*robot\.toml has link\.driver odrive"):
-        run_sim(SimOptions(vendors, board="/dev/ttyUSB1"))
+        run_sim(vendors, board="/dev/ttyUSB1")

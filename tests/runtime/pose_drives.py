@@ -138,7 +138,7 @@ def drive_circle(setup: Setup, planner: Planner, kind: PoseKind, seed: int, laps
         run.run(2.0)
         straight_m = math.hypot(run.robot.truth.x_m - before.x_m, run.robot.truth.y_m - before.y_m)
         started = run.run(1.5, UserRequest.ARM, UserRequest.START)
-        refused = [reply.text for tick in started for reply in tick.replies if not reply.accepted]
+        refused = [reply.text for tick in started for reply in tick.output.replies if not reply.accepted]
         if refused or not started[-1].output.running:
             raise WorkError(f"the virtual robot was not started: {refused}")
         return _driven(run, laps, straight_m)

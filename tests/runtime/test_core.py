@@ -127,7 +127,7 @@ def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
     last = stack.run(1.5)[-1].output
     assert last.state is State.FAULT, last.detail
     assert next(iter(limits)) in last.detail
-    assert not any(reply.accepted for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies)
+    assert not any(reply.accepted for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.output.replies)
     # The one that fits is taken again, once a person has reset.
     exchanged(stack)
     stack.run(1.5)
@@ -189,7 +189,7 @@ def test_a_wheel_that_turns_either_way_on_either_side_keeps_the_robot_from_being
 
     stack.core.driver.receive = turning
     stack.run(0.1)
-    (reply,) = (reply for tick in stack.run(0.02, UserRequest.ARM) for reply in tick.replies)
+    (reply,) = (reply for tick in stack.run(0.02, UserRequest.ARM) for reply in tick.output.replies)
     assert (reply.accepted, "the wheels are turning" in reply.text) == (False, True)
 
 

@@ -7,7 +7,7 @@ import tracemalloc
 import pytest
 
 from disco_hw.runtime import State
-from disco_hw.runtime.plausibility import Directions
+from disco_hw.runtime.directions import Directions
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor import AS_CONFIGURED, Wiring, rewired
 from drivers.types import PoseSample, WheelCommand, WheelSample
@@ -150,7 +150,7 @@ def test_the_daemons_tick_stops_the_robot_and_says_what_to_change(wiring):
     assert tick.output.state is State.FAULT
     assert "in robot.toml write wheels." in tick.output.detail
     assert max(abs(speeds.left_speed_rad_s), abs(speeds.right_speed_rad_s)) < 0.05
-    (refused,) = run.run(0.02, UserRequest.RESET)[0].replies
+    (refused,) = run.run(0.02, UserRequest.RESET)[0].output.replies
     assert not refused.accepted
 
 

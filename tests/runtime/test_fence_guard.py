@@ -53,8 +53,7 @@ def evaluate(fence: Fence, seen: PoseEstimate, requested, last=None, geometry=EX
 
 def test_without_a_fence_and_obstacles_nothing_is_judged():
     assert guard_of(Fence()).step(estimate(pose_ok=False), EXACT, (0, 0), (5, 5)) is IDLE
-    assert FenceGuard(None, STOPS, 0.05).step(estimate(), EXACT, (0, 0), (5, 5)) is IDLE
-    assert not FenceGuard(None, STOPS, 0.05).is_active
+    assert not guard_of(Fence()).is_active
     assert IDLE.scale == 1.0
     assert IDLE.verdict not in STOPS_MOTION
 
@@ -305,9 +304,7 @@ def test_the_time_at_each_point_of_the_path_is_when_the_robot_is_there():
         start_m = touches_at_end_m - velocity * end_s + (0.01 if passes_after else -0.01)
         guard.set_obstacles([MovingCircle(start_m, 0.0, radius, velocity, 0.0)])
         found = guard.step(estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed))
-        full = guard._stopping_paths(
-            guard.boundaries, estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed)
-        )[1][-1]
+        full = guard._stopping_paths(estimate(0, 0, 0, (speed, speed)), EXACT, (speed, speed), (speed, speed))[1][-1]
         assert full[-1].min() == pytest.approx(0.01 if passes_after else -0.01, abs=1e-6)
         assert found.scale < 1.0
 
@@ -328,7 +325,6 @@ def test_a_slower_controller_needs_a_longer_way():
     seen = ahead_of_wall(0.16, (5, 5))
     before = guard.step(seen, EXACT, (5, 5), (5, 5))
     guard.set_deceleration(10.0)
-    assert guard.settings == StoppingSettings(0.08, 0.1, 10.0, 0.02)
     after = guard.step(seen, EXACT, (5, 5), (5, 5))
     assert before.scale > after.scale
 
@@ -576,14 +572,14 @@ def test_the_nearer_of_the_paths_by_command_and_by_measurement_counts(sent, meas
     slow = evaluate(fence, estimate(0.5, 0.0, 0.0, (0.0, 0.0)), (2.0, 2.0)).clearance_m
     assert both == pytest.approx(alone)
     assert both < slow - 0.01
-    steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, sent, (2.0, 2.0))[2]
+    steps = guard_of(fence)._stopping_paths(seen, EXACT, sent, (2.0, 2.0))[2]
     assert steps[-1, 1] == pytest.approx(RADIUS * 5.0 * 0.08 / 3)
 
 
 def test_a_corner_moves_by_the_way_and_by_the_turn():
     fence = Fence(keep_in=CELL)
     seen = estimate(wheels=(1.0, 3.0))
-    steps = guard_of(fence)._stopping_paths(Boundaries(FOOTPRINT, fence), seen, EXACT, (1.0, 3.0), (1.0, 3.0))[2]
+    steps = guard_of(fence)._stopping_paths(seen, EXACT, (1.0, 3.0), (1.0, 3.0))[2]
     turn = RADIUS * 2.0 / AXLE * 0.08 / 3
     moved = math.hypot(RADIUS * 2.0 * 0.08 / 3, X_ICR * turn)
     assert steps[-1, 1] == pytest.approx(moved + FOOTPRINT.reach_m * turn)
@@ -613,10 +609,7 @@ def test_a_believed_spread_makes_turns_longer_too():
 def test_the_clearance_is_less_by_the_turn_that_is_not_known_along_the_path():
     spread = OdometryParameters(RADIUS, AXLE, X_ICR, ((0, 0, 0), (0, (0.01 * AXLE) ** 2, 0), (0, 0, 0)))
     fence, seen = Fence(keep_in=CELL), estimate(wheels=(1.0, 3.0))
-    bounds = Boundaries(FOOTPRINT, fence)
-    exact, wide = (
-        guard_of(fence)._stopping_paths(bounds, seen, one, (1.0, 3.0), (1.0, 3.0)) for one in (EXACT, spread)
-    )
+    exact, wide = (guard_of(fence)._stopping_paths(seen, one, (1.0, 3.0), (1.0, 3.0)) for one in (EXACT, spread))
     path = exact[0][-1]
     turned = np.abs(path[:, 2] - path[0, 2])
     moved = np.concatenate([[0.0], np.cumsum(np.hypot(RADIUS / AXLE * 0.0 + np.diff(turned) * X_ICR,
@@ -633,7 +626,7 @@ def test_an_obstacle_is_met_at_the_time_of_coming_to_a_slower_command():
     for end_s, crosswise in ((0.08 + 0.2 + 0.13 + 0.1, 0.0),):
         guard = guard_of(Fence())
         guard.set_obstacles([MovingCircle(3.0, 0.0, 0.1, -1.0, crosswise)])
-        found = guard._stopping_paths(guard.boundaries, estimate(wheels=before), EXACT, before, command)
+        found = guard._stopping_paths(estimate(wheels=before), EXACT, before, command)
         end_m = found[0][-1, -1, 0] + 0.3
         assert found[1][-1, -1, 1] == pytest.approx(3.0 - end_s - 0.1 - end_m)
 
@@ -643,7 +636,7 @@ def test_in_a_turn_the_faster_wheel_says_how_long_the_braking_lasts(before, comm
     guard = guard_of(Fence())
     velocity = -0.25
     guard.set_obstacles([MovingCircle(1.5, 0.0, 0.1, velocity, 0.0)])
-    found = guard._stopping_paths(guard.boundaries, estimate(wheels=before), EXACT, before, command)
+    found = guard._stopping_paths(estimate(wheels=before), EXACT, before, command)
     excess = max(max(now - then, 0.0) for now, then in zip(before, command, strict=True))
     end_s = 0.08 + excess / 20.0 + 0.13 + max(command) / 20.0
     there = Boundaries(FOOTPRINT, Fence(), [MovingCircle(1.5 + velocity * end_s, 0.0, 0.1)])

@@ -6,7 +6,7 @@ import numpy as np
 
 from disco_hw.control.plan import Diagnostics, WheelPlan
 from disco_hw.runtime.pipeline import Source
-from disco_hw.runtime.planner_events import LIMITED_PART, PlannerEvents
+from disco_hw.runtime.plausibility import LIMITED_PART, PlannerEvents
 
 LIMITED = "planner: the speed is limited by the wheels to 70% of the task's; the robot follows its line more slowly"
 

@@ -121,7 +121,7 @@ def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_sta
     assert f"{abs(off_m):.2f} m, and are not used" in mismatch
     # It never goes on by itself.
     assert not made.stack.run(3.0)[-1].output.running
-    (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.replies]
+    (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.output.replies]
     assert reply.accepted
     assert made.stack.run(1.0)[-1].output.running
 

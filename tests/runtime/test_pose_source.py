@@ -63,7 +63,7 @@ def test_without_wheels_poses_are_recorded_and_nothing_is_armed(monkeypatch):
     stack.core.pose_source = Elsewhere()
     stack.pilot = HandPilot(Hand(), Coverage(8.0))
     stack.run(1.5)
-    (reply,) = [reply for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.replies]
+    (reply,) = [reply for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.output.replies]
     assert (reply.accepted, reply.text) == (
         False,
         "not connected to the robot: the robot sends no wheel data; check the encoders and the controller",

@@ -222,7 +222,6 @@ def test_thirty_two_obstacles_are_kept_and_no_more():
     with pytest.raises(ObstacleRefused, match="there are 32 already; remove one first"):
         obstacles.report(0, report("another"))
     obstacles.report(0, report("one3", x_m=7.0))
-    assert obstacles.refused == 1
     obstacles.remove("one3")
     obstacles.report(0, report("another"))
     with pytest.raises(ObstacleRefused, match="obstacle one3: not known; known obstacles: another, one0"):
@@ -267,7 +266,6 @@ def test_reports_come_over_udp(robot_file):
             sender.sendto(b'{"name": "box", "x_m": 0.5, "y_m": 0, "radius_m": 0.1}', ("127.0.0.1", port))
             sender.sendto(b"nonsense", ("127.0.0.1", port))
         assert [one.name for one in source.receive(0)] == ["box"]
-        assert source.malformed == 1
         assert list(source.receive(0)) == []
     finally:
         source.close()

@@ -60,7 +60,6 @@ def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"daemon_error": "the pipeline raised ValueError"}, "the pipeline raised ValueError"),
         ({"driver_state": DriverState.ESTOP}, "detail of the driver"),
         ({"driver_state": DriverState.FAULT}, "detail of the driver"),
         ({"driver_state": DriverState.REFUSED}, "detail of the driver"),
@@ -83,7 +82,7 @@ def test_a_fault_whose_words_end_with_the_remedy_has_it_once(bench):
     out = bench.tick(driver_state=DriverState.FAULT, driver_detail="node 3 fell silent; remove the cause, then reset")
     assert out.detail == "node 3 fell silent; remove the cause, then reset"
     assert refusal(bench.tick(ARM)).count("reset") == 1
-    assert bench.tick(daemon_error="it failed").detail.endswith("then reset")
+    assert bench.tick(preflight_errors=("limits differ",)).detail.endswith("then reset")
 
 
 @pytest.mark.parametrize(
@@ -407,9 +406,6 @@ def test_start_is_refused_with_the_reason():
 
 def test_reset_is_refused_with_the_reason():
     assert "nothing to reset" in refusal(Bench().ready().tick(RESET))
-    bench = Bench().ready()
-    bench.tick(daemon_error="boom")
-    assert "boom" in refusal(bench.tick(RESET))
     bench = Bench().ready()
     bench.tick(preflight_errors=("limits differ",))
     assert "limits differ" in refusal(bench.tick(RESET))

@@ -34,7 +34,6 @@ VALUES = {
     "pose_ok": st.booleans(),
     "heading_missing": st.booleans(),
     "preflight_errors": st.sampled_from([(), ("limits differ",)]),
-    "daemon_error": st.sampled_from([None, "boom"]),
     "recording_fault": st.sampled_from(["", "no room"]),
 }
 ONE_CHANGE = st.sampled_from(sorted(VALUES)).flatmap(lambda name: st.fixed_dictionaries({name: VALUES[name]}))
@@ -50,7 +49,7 @@ def is_telemetry_lost(inputs):
 
 
 def troubled(inputs):
-    return bool(inputs.preflight_errors) or inputs.daemon_error is not None or inputs.driver_state in LATCHED
+    return bool(inputs.preflight_errors) or inputs.driver_state in LATCHED
 
 
 class SupervisorModel(RuleBasedStateMachine):

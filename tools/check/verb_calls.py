@@ -188,7 +188,7 @@ _ENDS_AFTER = (
     "disco_hw.first_use.commission.link_key",
 )
 _WITHOUT = {
-    "disco_hw.daemon.run.create_planner": lambda *_: NoPlanner(),
+    "disco_hw.daemon.run.planner_of": lambda *_: NoPlanner(),
     "disco_hw.runtime.replay.create_planner": lambda *_: NoPlanner(),
     "disco_hw.drive.drive_command.leads_to_virtual_robot": lambda _: True,
 }
