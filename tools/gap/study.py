@@ -27,7 +27,7 @@ from tools.gap.tables import summary, table, write
 ROOT = Path(__file__).resolve().parents[2]
 JUDGED = (
     "disco_hw/gap", "disco_hw/effects", "disco_hw/model", "disco_hw/log", "disco_hw/drive", "sim",
-    "tools/gap/halves.py", "tools/gap/jobs.py", "tools/gap/logs.py", "tools/gap/mujoco.py",
+    "tools/gap/black_box.py", "tools/gap/halves.py", "tools/gap/jobs.py", "tools/gap/logs.py", "tools/gap/mujoco.py",
     "tools/gap/strange_robot.py", "tools/joystick.py", "tools/mujoco_robot.py",
     "tools/simulated_drives.py", "tools/simulated_log.py",
 )  # fmt: skip
