@@ -14,7 +14,7 @@ import msgspec
 
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2_inlets import AHEAD_NS
-from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport, reports_in
+from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleRefused, ObstacleReport, reports_in
 
 TOPIC = "disco_hw/obstacles"
 TYPES = (msg.ObstacleArrayMsg, msg.String)
@@ -47,10 +47,13 @@ class ObstacleInlet:
         return [msgspec.json.encode(one) for one in reports]
 
     def _in_text(self, message: msg.String) -> Sequence[ObstacleReport]:
-        reports = reports_in(message.data.encode())
-        if not reports:
+        try:
+            reports = reports_in(message.data.encode())
+        except ObstacleRefused:
             self.refused["text that is not the JSON of docs/fence.md"] += 1
-        return reports
+            return ()
+        self._count_surplus(len(reports))
+        return reports[:MOST_OBSTACLES]
 
     def _in_array(self, message: msg.ObstacleArrayMsg, sent_ns: int, wall_ns: int) -> Sequence[ObstacleReport]:
         reports: list[ObstacleReport] = []
@@ -66,9 +69,12 @@ class ObstacleInlet:
                 self.refused["without a place, too large, too fast or not finite"] += 1
             else:
                 reports.append(found)
-        if len(message.obstacles) > MOST_OBSTACLES:
-            self.refused[f"more than {MOST_OBSTACLES} in a message"] += len(message.obstacles) - MOST_OBSTACLES
+        self._count_surplus(len(message.obstacles))
         return reports
+
+    def _count_surplus(self, count: int) -> None:
+        if count > MOST_OBSTACLES:
+            self.refused[f"more than {MOST_OBSTACLES} in a message"] += count - MOST_OBSTACLES
 
 
 def _report_of(one: msg.ObstacleMsg, age_s: float) -> ObstacleReport | None:
@@ -86,5 +92,7 @@ def _report_of(one: msg.ObstacleMsg, age_s: float) -> ObstacleReport | None:
         "radius_m": radius_m if radius_m != 0.0 else 1e-3,
         "vx_m_s": velocity.x, "vy_m_s": velocity.y, "age_s": age_s,
     }  # fmt: skip
-    found = reports_in(msgspec.msgpack.encode(fields))
-    return found[0] if found else None
+    try:
+        return reports_in(msgspec.msgpack.encode(fields))[0]
+    except ObstacleRefused:
+        return None

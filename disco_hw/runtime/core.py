@@ -7,7 +7,6 @@ a pilot says: the task's planner, or somebody in its place.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -19,7 +18,7 @@ from disco_hw.log import records
 from disco_hw.log.recorder import Recorder
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.directions import Directions
-from disco_hw.runtime.obstacles import ObstacleRefused, UdpObstacles
+from disco_hw.runtime.obstacles import TOO_MANY, ObstacleRefused, UdpObstacles
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
 from disco_hw.runtime.plausibility import FOLLOWS, Headway, PlannerEvents, Plausibility, PlausibilityStats, PoseJumps
 from disco_hw.runtime.robot_setup import record_of
@@ -232,9 +231,13 @@ class DaemonCore:
         if self.driver.limits is not None:
             stops = self.driver.limits.stop_deceleration_rad_s2.value
             self.area.guard.set_deceleration(min(stops, self.config.robot.max_wheel_acceleration_rad_s2))
-        for report in () if self.obstacle_source is None else self.obstacle_source.receive(now_ns):
-            with suppress(ObstacleRefused):
-                self.area.report(now_ns, report)
+        if self.obstacle_source is not None:
+            for report in self.obstacle_source.receive(now_ns):
+                try:
+                    self.area.report(now_ns, report)
+                except ObstacleRefused:
+                    self.obstacle_source.refused.add(now_ns, f"obstacle {report.name}", TOO_MANY)
+            self.area.tell(self.obstacle_source.refused.new_messages())
         return self.area.begin(now_ns, by_hand)
 
     def _follow_link(self, now_ns: int) -> None:

@@ -22,11 +22,13 @@ from msgspec import Meta
 from disco_hw.config import RobotConfig
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import MovingCircle
+from drivers.pose.senders import RefusedDatagrams
 from drivers.pose.udp import open_udp_port
 from drivers.samples import FARTHEST_M
 
 # Chosen: each takes time of the fence guard and the planner in every tick; further ones are refused.
 MOST_OBSTACLES = 32
+TOO_MANY = f"there may be {MOST_OBSTACLES}; report the nearest ones"
 REPORTED_AGE_LIMIT_S = 1.0
 """Age limit of a report over UDP or ROS 2 that says none."""
 ENTERED_AGE_LIMIT_S = 600.0
@@ -169,13 +171,22 @@ class UdpObstacles:
 
     def __init__(self, opened: socket.socket) -> None:
         self._socket = opened
+        self.refused = RefusedDatagrams()
 
     def receive(self, now_ns: int) -> Sequence[ObstacleReport]:
         """Return the obstacles reported since the last call, oldest first; never waits and never raises."""
         reports: list[ObstacleReport] = []
         with contextlib.suppress(OSError):
             for _ in range(_DATAGRAMS_A_TICK):
-                reports += reports_in(self._socket.recv(_LONGEST_DATAGRAM))
+                datagram, (address, port) = self._socket.recvfrom(_LONGEST_DATAGRAM)
+                try:
+                    found = reports_in(datagram)
+                except ObstacleRefused as refused:
+                    self.refused.add(now_ns, f"{address}:{port} sends {refused}", "docs/fence.md shows a report")
+                    continue
+                reports += found[:MOST_OBSTACLES]
+                for surplus in found[MOST_OBSTACLES:]:
+                    self.refused.add(now_ns, f"obstacle {surplus.name} from {address}:{port}", TOO_MANY)
         return reports
 
     def close(self) -> None:
@@ -184,11 +195,13 @@ class UdpObstacles:
 
 
 def reports_in(datagram: bytes) -> list[ObstacleReport]:
-    """Return the reports in a datagram, at most 32; empty for what holds none or one that is not right."""
+    """Return the reports in a datagram. Raises ObstacleRefused for what holds none, or one that is not right."""
     decoder = _JSON if datagram[:1] in (b"{", b"[") else _MESSAGE_PACK
     try:
         read = decoder.decode(datagram)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return []
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ObstacleRefused(f"what is no report of obstacles ({str(error)[:80]})") from None
     reports = read if isinstance(read, list) else [read]
-    return reports[:MOST_OBSTACLES] if all(map(_is_finite, reports)) else []
+    if not all(map(_is_finite, reports)):
+        raise ObstacleRefused("an obstacle with a number that is not finite")
+    return reports

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import msgspec
@@ -102,6 +102,10 @@ class SafeArea:
         """Take in one obstacle. Raises ObstacleRefused."""
         self.obstacles.report(now_ns, report)
         self._pending.append(records.Obstacle(now_ns, *msgspec.structs.astuple(report)))
+
+    def tell(self, messages: Iterable[str]) -> None:
+        """Have these sentences on obstacles reported as events of this tick."""
+        self._events += [f"fence: {text}" for text in messages]
 
     def handle_request(self, now_ns: int, requested: Mapping[str, Any]) -> str:
         """Add or remove the obstacle that a person names; returns the answer in words. Raises ObstacleRefused."""

@@ -77,7 +77,7 @@ class BridgePoses:
                 if user not in self._users:
                     self.foreign_users += 1
                     text = f"process {process} of user {user} sends poses to the bridge's port"
-                    self._senders.refuse(now_ns, text, "only the daemon's user and root may")
+                    self._senders.refused.add(now_ns, text, "only the daemon's user and root may")
                 elif (pose := self._handle(datagram, f"bridge process {process}", now_ns)) is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
@@ -102,7 +102,7 @@ class BridgePoses:
             self._messages.append(text)
         else:
             self.malformed += 1
-            self._senders.refuse(now_ns, f"the {sender} sends no pose but {pose}", POSE_HINT)
+            self._senders.refused.add(now_ns, f"the {sender} sends no pose but {pose}", POSE_HINT)
         return None
 
 

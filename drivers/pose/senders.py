@@ -58,6 +58,30 @@ class PoseProof:
         return payload[TIME_BYTES:]
 
 
+class RefusedDatagrams:
+    """Counts datagrams that are not used, and has one in ten seconds reported."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._messages: list[str] = []
+        self._next_report_ns = 0
+        self._unreported = 0
+
+    def add(self, now_ns: int, text: str, hint: str) -> None:
+        """Count a datagram, and report it unless another was reported in the last ten seconds."""
+        self.count += 1
+        self._unreported += 1
+        if now_ns >= self._next_report_ns:
+            self._next_report_ns = now_ns + REPORT_AGAIN_NS
+            self._messages.append(f"{text}: not used ({self._unreported} datagrams); {hint}")
+            self._unreported = 0
+
+    def new_messages(self) -> list[str]:
+        """Return what a person should know since the last call."""
+        messages, self._messages = self._messages, []
+        return messages
+
+
 class SenderGate:
     """Keeps to one sender: the first whose pose is good, until it has been silent; all others are counted and named.
 
@@ -66,15 +90,13 @@ class SenderGate:
     """
 
     def __init__(self, silence_s: float = SILENCE_S, allow: Collection[str] | None = None) -> None:
-        self.refused = 0
+        self.refused = RefusedDatagrams()
         self._silence_ns = round(silence_s * 1e9)
         self._allowed = None if allow is None else parse_allowed(allow)
         self._known: dict[str, bool] = {}
         self._kept: Hashable | None = None
         self._came_ns = 0
         self._messages: list[str] = []
-        self._next_report_ns = 0
-        self._unreported = 0
 
     @property
     def kept_address(self) -> str | None:
@@ -84,13 +106,13 @@ class SenderGate:
     def may_send(self, sender: Hashable, now_ns: int) -> bool:
         """Return whether a datagram of this sender is worth reading; one that is not is counted and reported."""
         if self._allowed is not None and not self._is_allowed(sender):
-            self.refuse(
+            self.refused.add(
                 now_ns, f"{_name(sender)} sends poses but is not in pose.allow", "add it there, or stop that sender"
             )
             return False
         if self._kept in (None, sender) or now_ns - self._came_ns >= self._silence_ns:
             return True
-        self.refuse(
+        self.refused.add(
             now_ns,
             f"{_name(sender)} sends poses while {_name(self._kept)} does",
             f"stop one of them; {_name(self._kept)} is used until it has sent nothing for "
@@ -107,19 +129,10 @@ class SenderGate:
             )
         self._kept, self._came_ns = sender, now_ns
 
-    def refuse(self, now_ns: int, text: str, hint: str) -> None:
-        """Count a refused datagram, and report it unless another was reported in the last ten seconds."""
-        self.refused += 1
-        self._unreported += 1
-        if now_ns >= self._next_report_ns:
-            self._next_report_ns = now_ns + REPORT_AGAIN_NS
-            self._messages.append(f"{text}: not used ({self._unreported} datagrams); {hint}")
-            self._unreported = 0
-
     def new_messages(self) -> list[str]:
         """Return what a person should know since the last call."""
         messages, self._messages = self._messages, []
-        return messages
+        return [*messages, *self.refused.new_messages()]
 
     def _is_allowed(self, sender: Hashable) -> bool:
         address = sender[0] if isinstance(sender, tuple) else str(sender)

@@ -103,7 +103,7 @@ class UdpPoses:
     @property
     def refused(self) -> int:
         """Number of datagrams refused for their sender or for want of a proof."""
-        return self._senders.refused
+        return self._senders.refused.count
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the poses received since the last call, oldest first; never waits and never raises."""
@@ -131,13 +131,13 @@ class UdpPoses:
             opened = self._proof.unwrap(datagram, time.time_ns())
             if isinstance(opened, str):
                 text = f"{sender[0]}:{sender[1]} sends poses {opened}"
-                self._senders.refuse(now_ns, text, "docs/poses.md describes what a sender with a key sends")
+                self._senders.refused.add(now_ns, text, "docs/poses.md describes what a sender with a key sends")
                 return None
             datagram = opened
         pose = pose_of(datagram, now_ns)
         if isinstance(pose, str):
             self.malformed += 1
-            self._senders.refuse(now_ns, f"{sender[0]}:{sender[1]} sends no pose but {pose}", POSE_HINT)
+            self._senders.refused.add(now_ns, f"{sender[0]}:{sender[1]} sends no pose but {pose}", POSE_HINT)
             return None
         self._senders.note_pose(sender, now_ns)
         return pose

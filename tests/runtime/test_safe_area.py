@@ -33,6 +33,7 @@ from disco_hw.runtime.pipeline import Limited, Manual, NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.safe_area import OVERRIDE_NS, FenceRefused, SafeArea, fence_of_record, report_of_record
 from disco_hw.runtime.supervisor import UserRequest
+from drivers.pose.senders import RefusedDatagrams
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 from tests.runtime.simulated import arm, replayed, write_run
@@ -57,6 +58,21 @@ class Hand:
         return PilotTick(motion=Manual(*self.wheels), by_hand=True)
 
     def learn(self, now_ns, tick, replies):
+        pass
+
+
+class FewObstacles:
+    """A source that reports these obstacles once."""
+
+    def __init__(self, reports):
+        self.reports = reports
+        self.refused = RefusedDatagrams()
+
+    def receive(self, now_ns):
+        reports, self.reports = self.reports, []
+        return reports
+
+    def close(self):
         pass
 
 
@@ -240,20 +256,22 @@ def test_what_is_no_obstacle_is_refused_in_one_line(fields):
     assert report_from(valid).age_limit_s == 1.0
     with pytest.raises(ObstacleRefused, match=r"obstacle: .*; write"):
         report_from({**valid, **fields})
-    assert reports_in(msgspec.json.encode({**valid, **fields})) == []
+    with pytest.raises(ObstacleRefused):
+        reports_in(msgspec.json.encode({**valid, **fields}))
 
 
 def test_datagrams_of_one_and_of_several_are_taken():
     one = {"name": "box", "x_m": 0.0, "y_m": 1.0, "radius_m": 0.1}
     assert [each.name for each in reports_in(msgspec.json.encode(one))] == ["box"]
     many = [{**one, "name": f"box{k}"} for k in range(40)]
-    assert len(reports_in(msgspec.json.encode(many))) == MOST_OBSTACLES
+    assert len(reports_in(msgspec.json.encode(many))) == 40
     assert [each.y_m for each in reports_in(msgspec.msgpack.encode([one]))] == [1.0]
     for garbage in (b"", b"{", b"[1]", b"\xff\xff", b"{}" * 3):
-        assert reports_in(garbage) == []
+        with pytest.raises(ObstacleRefused, match="what is no report of obstacles"):
+            reports_in(garbage)
 
 
-def test_reports_come_over_udp(robot_file):
+def test_reports_come_over_udp_and_of_what_is_not_used_it_is_said_why(robot_file):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -265,11 +283,32 @@ def test_reports_come_over_udp(robot_file):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.sendto(b'{"name": "box", "x_m": 0.5, "y_m": 0, "radius_m": 0.1}', ("127.0.0.1", port))
             sender.sendto(b"nonsense", ("127.0.0.1", port))
-        assert [one.name for one in source.receive(0)] == ["box"]
-        assert list(source.receive(0)) == []
+            assert [one.name for one in source.receive(0)] == ["box"]
+            assert list(source.receive(0)) == []
+            (text,) = source.refused.new_messages()
+            assert f"127.0.0.1:{sender.getsockname()[1]} sends what is no report of obstacles (" in text
+            many = [{"name": f"box{k}", "x_m": 0.5, "y_m": 0.0, "radius_m": 0.1} for k in range(MOST_OBSTACLES + 2)]
+            sender.sendto(msgspec.msgpack.encode(many), ("127.0.0.1", port))
+            assert len(source.receive(10_000_000_000)) == MOST_OBSTACLES
+        (text,) = source.refused.new_messages()
+        assert text.startswith("obstacle box32 from 127.0.0.1:")
+        assert "there may be 32; report the nearest ones" in text
+        assert source.refused.count == 3
     finally:
         source.close()
     assert obstacle_source_of(config) is None
+
+
+def test_of_an_obstacle_that_is_one_too_many_an_event_says_so(robot_file):
+    run, _ = by_hand(robot_file)
+    source = FewObstacles(
+        [report_from({"name": f"box{k}", "x_m": 9.0, "y_m": 9.0, "radius_m": 0.1}) for k in range(33)]
+    )
+    run.core.obstacle_source = source
+    events = events_of(run.run(0.1))
+    assert [event for event in events if "box32" in event] == [
+        "fence: obstacle box32: not used (1 datagrams); there may be 32; report the nearest ones"
+    ]
 
 
 def test_a_person_adds_and_removes_obstacles_and_all_is_recorded():

@@ -42,7 +42,7 @@ def test_the_first_sender_is_kept_until_it_has_been_silent():
     assert gate.may_send(SECOND, 4_500_000_000)
     gate.note_pose(SECOND, 4_500_000_000)
     assert not gate.may_send(FIRST, 4_600_000_000)
-    assert gate.refused == 8
+    assert gate.refused.count == 8
 
 
 def test_a_flood_of_refused_datagrams_is_reported_once_in_ten_seconds_with_their_number():
