@@ -333,15 +333,11 @@ class PoseFilter:
             candidate = (
                 candidate.each(follow) if isinstance(candidate, HeadingSearch) else candidate and follow(candidate)
             )
-        return msgspec.structs.replace(
-            state,
-            t_ns=t_ns,
-            left_rad=left_rad,
-            right_rad=right_rad,
-            belief=belief,
-            candidate=candidate,
-            evaluation=None,
-        )
+        # Not by `replace`, as it is of each wheel sample: a tick would take a tenth longer.
+        return FilterState(
+            t_ns, left_rad, right_rad, belief, candidate, state.candidate_count, state.pose_t_ns,
+            state.reinitialisations, None, state.candidate_of, state.accepted,
+        )  # fmt: skip
 
 
 def _evaluation(reason: PoseReason, correction: Correction, limit: float) -> Evaluation:

@@ -252,8 +252,8 @@ class PoseBelief(msgspec.Struct, frozen=True, gc=False):
         """The whole covariance as nested tuples, symmetric to the bit."""
         xx, xy, xt, yy, yt, tt = self.xx, self.xy, self.xt, self.yy, self.yt, self.tt
         if self.sensitivity is not None:
-            by_parameters = covariance_by_parameters(self.sensitivity)
-            xx, xy, xt, yy, yt, tt = (a + b for a, b in zip((xx, xy, xt, yy, yt, tt), by_parameters, strict=True))
+            wxx, wxy, wxt, wyy, wyt, wtt = covariance_by_parameters(self.sensitivity)
+            return (xx + wxx, xy + wxy, xt + wxt), (xy + wxy, yy + wyy, yt + wyt), (xt + wxt, yt + wyt, tt + wtt)
         return (xx, xy, xt), (xy, yy, yt), (xt, yt, tt)
 
 
