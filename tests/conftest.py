@@ -30,12 +30,12 @@ PARTS = (
     ("hil", "firmware_protocol/emulated"),
     ("gap",),
     ("log",),
-    ("drivers", "estimation", "effects"),
-    ("runtime", "tasks", "adaptation"),
-    ("control", "tools"),
-    ("drive", "inference", "viewer"),
+    ("drivers", "effects"),
+    ("runtime", "adaptation"),
+    ("control", "estimation", "tasks"),
+    ("inference", "viewer"),
     ("daemon", "model", "sim"),
-    ("cli", "experiments", "first_use"),
+    ("cli", "drive", "experiments", "first_use"),
 )
 # These run while the kernels that the others share are being compiled.
 WITHOUT_KERNELS = (

@@ -28,9 +28,8 @@ from disco_hw.runtime.fence_guard import FenceVerdict
 from disco_hw.runtime.pipeline import Manual, NoPlanner, Planner
 from disco_hw.runtime.robot_setup import Setup, load_setup
 from disco_hw.runtime.safe_area import SafeArea
-from disco_hw.tasks import RobotTask
+from disco_hw.tasks import RobotTask, task_from
 from disco_hw.tasks.circle import CircleTask
-from disco_hw.tasks.path import PathTask
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
@@ -259,8 +258,8 @@ def corridor_setup(rng: np.random.Generator) -> Setup:
     behind_m, side_m = -2.0 * FOOTPRINT.reach_m, 0.5
     corners = ((behind_m, -side_m), (end_m, -side_m), (end_m, side_m), (behind_m, side_m))
     line = ((0.0, 0.0), (end_m + _BEYOND_M, 0.0))
-    # Its way-points stand in no file.
-    task = PathTask(path="corridor", speed_m_s=_CORRIDOR_M_S, points=line)
+    # Chosen as robot.toml does. Its way-points stand in no file.
+    task = msgspec.structs.replace(task_from({"path": "corridor", "speed_m_s": _CORRIDOR_M_S}), points=line)  # type: ignore[type-var]
     setup = fenced_setup(Fence(keep_in=corners, margin_m=0.01), task)
     robot = msgspec.structs.replace(setup.config.robot, max_wheel_acceleration_rad_s2=_SOFT_RAD_S2)
     return replace(setup, config=msgspec.structs.replace(setup.config, robot=robot))
