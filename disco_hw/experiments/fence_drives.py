@@ -258,11 +258,16 @@ def corridor_setup(rng: np.random.Generator) -> Setup:
     behind_m, side_m = -2.0 * FOOTPRINT.reach_m, 0.5
     corners = ((behind_m, -side_m), (end_m, -side_m), (end_m, side_m), (behind_m, side_m))
     line = ((0.0, 0.0), (end_m + _BEYOND_M, 0.0))
-    # Chosen as robot.toml does. Its way-points stand in no file.
-    task = msgspec.structs.replace(task_from({"path": "corridor", "speed_m_s": _CORRIDOR_M_S}), points=line)  # type: ignore[type-var]
-    setup = fenced_setup(Fence(keep_in=corners, margin_m=0.01), task)
+    task = _task(path="corridor", speed_m_s=_CORRIDOR_M_S)
+    # Its way-points stand in no file.
+    setup = fenced_setup(Fence(keep_in=corners, margin_m=0.01), msgspec.structs.replace(task, points=line))
     robot = msgspec.structs.replace(setup.config.robot, max_wheel_acceleration_rad_s2=_SOFT_RAD_S2)
     return replace(setup, config=msgspec.structs.replace(setup.config, robot=robot))
+
+
+def _task(**section: Any) -> Any:
+    """Return the task that these fields in [task] of robot.toml would choose."""
+    return task_from(section)
 
 
 def along_drive(rng: np.random.Generator, off: float, seconds: float) -> FencedDrive:
