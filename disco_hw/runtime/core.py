@@ -237,7 +237,7 @@ class DaemonCore:
                     self.area.report(now_ns, report)
                 except ObstacleRefused:
                     self.obstacle_source.refused.add(now_ns, f"obstacle {report.name}", TOO_MANY)
-            self.area.tell(self.obstacle_source.refused.new_messages())
+            self.area.notify(self.obstacle_source.refused.new_messages())
         return self.area.begin(now_ns, by_hand)
 
     def _follow_link(self, now_ns: int) -> None:

@@ -103,7 +103,7 @@ class SafeArea:
         self.obstacles.report(now_ns, report)
         self._pending.append(records.Obstacle(now_ns, *msgspec.structs.astuple(report)))
 
-    def tell(self, messages: Iterable[str]) -> None:
+    def notify(self, messages: Iterable[str]) -> None:
         """Have these sentences on obstacles reported as events of this tick."""
         self._events += [f"fence: {text}" for text in messages]
 

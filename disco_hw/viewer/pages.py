@@ -55,7 +55,7 @@ class _Due:
 
 
 class _Column:
-    """What both pages show beside the scene: state, motions driven by hand, plots, events, and all other figures."""
+    """Column beside the scene on both pages: state, motions driven by hand, plots, events, and all other figures."""
 
     def __init__(self, gui: viser.GuiApi, stage: ShownRobot) -> None:
         self._stage = stage

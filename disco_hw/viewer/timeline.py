@@ -113,7 +113,7 @@ class Items(Generic[Item]):
         del self._times[:first], self._items[:first]
 
     def clear(self) -> None:
-        """Forget all records."""
+        """Remove all records."""
         self._times.clear()
         self._items.clear()
 

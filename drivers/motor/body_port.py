@@ -1,4 +1,4 @@
-"""What bases have in common that take speed and turn rate of their body: settings, and the port to `VendorDriver`."""
+"""Settings and port of bases that take speed and turn rate of their body, common to all of them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class BodyPort(Port):
     settings: BodySettings
 
     def __init__(self, settings: BodySettings, watchdog_s: float, timeout: Limit) -> None:
-        """`watchdog_s`: of `Table`; `timeout`: the base's own, and who states it."""
+        """Create the port; `watchdog_s` is that of `Table`, `timeout` the base's own and who states it."""
         self.settings, self._timeout = settings, timeout
         slowdown = settings.stop_deceleration_rad_s2
         self.table = Table(stop_deceleration_rad_s2=slowdown, watchdog_s=watchdog_s, zeros_to_arm=5)
