@@ -78,7 +78,8 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     wait_until(lambda: not alive(stopped))
     messages = recorder.new_messages()
     assert "was stopped" in messages[0]
-    assert messages[1] == f"recording goes on in {path.with_name('run.part2.mcap')}"
+    # On a busy host the next writer may be late at first, which is reported too.
+    assert f"recording goes on in {path.with_name('run.part2.mcap')}" in messages[1:]
     final = recorder.close()
     assert all_accounted(final, following - 1)
     assert (final.dropped_ticks, final.lost_ticks, final.waiting_ticks) == (0, 0, 0)
