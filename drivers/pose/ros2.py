@@ -64,8 +64,6 @@ class BridgePoses:
         self._users = {os.geteuid(), _ROOT}
         self._senders = senders
         self._messages: list[str] = []
-        self.malformed = 0
-        self.foreign_users = 0
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
         """Return the poses received since the last call, oldest first; never waits and never raises."""
@@ -75,12 +73,16 @@ class BridgePoses:
                 datagram, ancillary, _, _ = self._socket.recvmsg(LONGEST_DATAGRAM, socket.CMSG_SPACE(_CREDENTIALS.size))
                 process, user = _sender(ancillary)
                 if user not in self._users:
-                    self.foreign_users += 1
                     text = f"process {process} of user {user} sends poses to the bridge's port"
                     self._senders.refused.add(now_ns, text, "only the daemon's user and root may")
                 elif (pose := self._handle(datagram, f"bridge process {process}", now_ns)) is not None:
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.t_ns)
+
+    @property
+    def refused(self) -> int:
+        """Number of datagrams refused for their sender, or because they hold no pose."""
+        return self._senders.refused.count
 
     def new_messages(self) -> Sequence[str]:
         """Return messages for the operator since the last call."""
@@ -101,7 +103,6 @@ class BridgePoses:
         if (text := message_of(datagram)) is not None:
             self._messages.append(text)
         else:
-            self.malformed += 1
             self._senders.refused.add(now_ns, f"the {sender} sends no pose but {pose}", POSE_HINT)
         return None
 

@@ -98,11 +98,10 @@ class UdpPoses:
         self._socket = opened
         self._senders = senders
         self._proof = proof
-        self.malformed = 0
 
     @property
     def refused(self) -> int:
-        """Number of datagrams refused for their sender or for want of a proof."""
+        """Number of datagrams refused for their sender, for want of a proof, or because they hold no pose."""
         return self._senders.refused.count
 
     def receive(self, now_ns: int, from_robot: Sequence[PoseSample]) -> Sequence[PoseSample]:
@@ -136,7 +135,6 @@ class UdpPoses:
             datagram = opened
         pose = pose_of(datagram, now_ns)
         if isinstance(pose, str):
-            self.malformed += 1
             self._senders.refused.add(now_ns, f"{sender[0]}:{sender[1]} sends no pose but {pose}", POSE_HINT)
             return None
         self._senders.note_pose(sender, now_ns)

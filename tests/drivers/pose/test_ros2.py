@@ -37,7 +37,7 @@ def send_datagrams(*datagrams):
 def test_poses_come_in_the_order_of_their_times_and_the_rest_is_counted(source):
     send_datagrams(*(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS - age}) for age in (10, 50)), b"hello", b"")
     assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50, 10]
-    assert (source.malformed, source.foreign_users) == (2, 0)
+    assert source.refused == 2
     (text,) = source.new_messages()
     assert text.startswith(f"the bridge process {os.getpid()} sends no pose but what cannot be read as one (")
 
@@ -48,7 +48,7 @@ def test_what_another_user_says_does_not_count(source):
     address = bridge_address(PORT).hex()
     subprocess.run([sys.executable, "-c", AS_A_STRANGER, address], input=datagram, check=True, timeout=60)
     assert list(source.receive(NOW_NS, ())) == []
-    assert source.foreign_users == 1
+    assert source.refused == 1
     (text,) = source.new_messages()
     assert "of user 65534 sends poses to the bridge's port: not used (1 datagrams); only the daemon's user" in text
 

@@ -89,7 +89,7 @@ def test_over_a_real_socket_in_order_and_the_malformed_counted_and_said(port):
             sender.sendto(json.dumps({**POSE, "age_s": age_s}).encode(), ("127.0.0.1", port))
         sender.sendto(b"hello", ("127.0.0.1", port))
         assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50_000_000, 10_000_000]
-    assert source.malformed == 1
+    assert source.refused == 1
     (text,) = source.new_messages()
     assert re.fullmatch(
         r"127\.0\.0\.1:\d+ sends no pose but what cannot be read as one \(.*\): not used \(1 datagrams\); docs/.*", text
