@@ -252,8 +252,8 @@ def _turn_back(path: PathTable, heading: Array, turned_rad: float, least_m: floa
 
 # Chosen: the heading's equation grows stiff towards 0, where its solution is the line's direction.
 SMALLEST_X_ICR_M = 0.01
-# Chosen: the heading of a closed line has then forgotten where it began.
-_LAPS = 3
+# Chosen: over so many times x_icr the heading of a closed line forgets where it began, but for rounding.
+_FORGETS_X_ICR = 40.0
 
 
 def stable_yaw(along_rad: Array, spacing_m: float | Array, x_icr_m: float, closed: bool) -> Array:
@@ -270,13 +270,20 @@ def stable_yaw(along_rad: Array, spacing_m: float | Array, x_icr_m: float, close
     left = [math.exp(-one / x_icr_m) for one in np.broadcast_to(spacing_m, along_rad.shape).tolist()]
     turn = math.remainder(along_rad[0] - along_rad[-1], 2.0 * math.pi) + along_rad[-1] - along_rad[0] if closed else 0.0
     directions = along_rad.tolist()
-    yaw = [directions[-1]] * (len(directions) + 1)
-    for _ in range(_LAPS if closed else 1):
-        for at in range(len(directions) - 1, -1, -1):
-            # The exact solution over a straight piece.
-            half = 0.5 * (yaw[at + 1] - directions[at])
-            yaw[at] = directions[at] + 2.0 * math.atan2(left[at] * math.sin(half), math.cos(half))
-        yaw[-1] = yaw[0] + turn if closed else yaw[-1]
+    count = len(directions)
+    # A closed line is gone round from behind its end.
+    behind = math.ceil(_FORGETS_X_ICR * x_icr_m / float(np.mean(spacing_m))) if closed else 0
+    after = directions[(behind - 1) % count]
+    yaw = [after] * (count + 1)
+    for place in range(behind + count - 1, -1, -1):
+        at = place % count
+        # The exact solution over a straight piece.
+        half = 0.5 * (after - directions[at])
+        after = directions[at] + 2.0 * math.atan2(left[at] * math.sin(half), math.cos(half))
+        yaw[place if place < count else 0] = after
+        if at == 0 and place:
+            after += turn
+            yaw[count] = after
     return np.array(yaw)
 
 
