@@ -5,7 +5,8 @@ known to all. From rest on the line; figures are of 5 to 30 s, at 50 plans a sec
 were found on robots 0 to 4 (`docs/results.md`); these are robots 1000 on, or others with `--first`.
 Names that begin with `mujoco_` drive the robot of `tools/mujoco_plant.py`, those with `turned_` the same robots with
 their back as their front (`turned_robot`), as the MPC drives them. Ways that begin with `timed_` are
-way-points by time, of which the distance from the line is shown.
+way-points by time, of which the distance from the line is shown. With `--slope 0.03` the ground carries the moving
+robots of `tools/foreign_plant.py` by so much (m/s).
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
 `... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
@@ -72,7 +73,12 @@ def _nmpc(speed_m_s: float, forward: bool, robot: ForeignRobot, track: Track) ->
 
 
 def rows(
-    count: int, names: tuple[str, ...], ways: tuple[str, ...], first: int = FIRST, speed_m_s: float = SPEED_M_S
+    count: int,
+    names: tuple[str, ...],
+    ways: tuple[str, ...],
+    first: int = FIRST,
+    speed_m_s: float = SPEED_M_S,
+    slope_m_s: float = 0.0,
 ) -> Iterator[tuple[str, list[Drive]]]:
     """The drives of these contenders on robots `first` to `first + count` - 1, and what they are called, by way."""
     for name in names:
@@ -81,7 +87,7 @@ def rows(
         contender = name
         if contender.startswith(MUJOCO):
             made, plant_of, contender = mujoco_robots, mujoco_plant, contender.removeprefix(MUJOCO)
-        driven = made(first, count)
+        driven = [replace(robot, slope_m_s=slope_m_s) for robot in made(first, count)]
         if contender.startswith(TURNED):
             driven, contender = [turned_robot(robot) for robot in driven], contender.removeprefix(TURNED)
         for way in ways:
@@ -191,6 +197,7 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--count", type=int, help="the same")
     parser.add_argument("--first", type=int, default=FIRST, help="the first robot's number")
     parser.add_argument("--speeds", default=str(SPEED_M_S), help="speeds of the tracks (m/s), comma-separated")
+    parser.add_argument("--slope", type=float, default=0.0, help="how fast the ground carries the robots (m/s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object of all figures at the end")
     options = parser.parse_args(arguments)
     if options.names == "starts":
@@ -199,10 +206,12 @@ def main(arguments: list[str]) -> None:
                 print(f"{key:60} {value:10.3g}", flush=True)
         return
     names, ways = options.names.split(","), options.ways.split(",")
+    if options.slope and any(name.startswith(MUJOCO) for name in names):
+        parser.error("--slope: the robot in MuJoCo stands on level ground")
     count = options.count or int(options.robots or 6)
     figures: dict[str, float] = {}
     for speed in options.speeds.split(","):
-        for key, drives in rows(count, tuple(names), tuple(ways), options.first, float(speed)):
+        for key, drives in rows(count, tuple(names), tuple(ways), options.first, float(speed), options.slope):
             found = figures_of(drives)
             named = f"{key}.{float(speed):g}"
             figures |= {f"{named}.{field}": value for field, value in found.items()}

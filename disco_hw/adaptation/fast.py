@@ -6,6 +6,7 @@ in the same tick, and a replay reads it from the log.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +21,8 @@ from drivers.types import Readings
 # Chosen: shorter follows a change sooner, and has the planner prepare its tables more often.
 PERIOD_S = 0.5
 SIGNIFICANT_STD, SIGNIFICANT_WIDTH = 0.1, 0.97
-"""A belief goes into force when its mean has moved by so many standard deviations, or its width by this factor."""
+"""A belief goes into force when its mean or the ground's drift has moved by so many standard deviations, or its width
+by this factor."""
 LEAST_POSES = 10
 """Poses taken before the first belief goes into force."""
 # The filter's order is wheel radius, axial distance, x_icr; that of NAMES begins with x_icr.
@@ -36,17 +38,16 @@ class FastAdaptation:
 
     def __init__(
         self, model: Geometry, low: np.ndarray, high: np.ndarray, apply_geometry: Callable[[Geometry | None], None],
-        drifts: bool = False,
     ) -> None:  # fmt: skip
         self._model, self._in_force, self._apply_geometry = model, model, apply_geometry
         self._low, self._high = low, high
         order = np.ix_(_FROM_NAMES, _FROM_NAMES)
         self._filter = GeometryFilter(
-            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES], drifts
+            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES]
         )
         self._next_ns: int | None = None
         self._poses = self._changes = self._carried = 0
-        self._adapted = self._paused = False
+        self._adapted = self._paused = self._on_slope = False
         self._requested: str | None = None
         self._text = "nothing driven yet"
         self._counts = dict.fromkeys(("published", "refused", "reverted", "changes", "carried"), 0)
@@ -68,7 +69,8 @@ class FastAdaptation:
         filtered = self._filter
         moved = filtered.poses > max(self._poses, LEAST_POSES)
         self._poses = filtered.poses
-        geometry = Geometry(filtered.mean[_TO_NAMES], filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)])
+        covariance = filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)]
+        geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s)
         if not moved or not self._is_significant(geometry):
             return AdaptationUpdate(events=events)
         fault = geometry_fault(geometry, self._low, self._high)
@@ -107,6 +109,7 @@ class FastAdaptation:
             "mean": dict(zip(NAMES, self._in_force.mean.tolist(), strict=True)),
             "std": dict(zip(NAMES, self._in_force.std.tolist(), strict=True)),
             "covariance": self._in_force.covariance.ravel().tolist(),
+            "drift_m_s": list(self._in_force.drift_m_s),
             "misfit": self._filter.innovation_ratio,
             **self._counts,
         }
@@ -119,7 +122,9 @@ class FastAdaptation:
         old = self._in_force
         width = geometry.std / old.std
         moved = np.abs(geometry.mean - old.mean) > SIGNIFICANT_STD * np.minimum(geometry.std, old.std)
-        return bool(moved.any() or (width < SIGNIFICANT_WIDTH).any() or (width > 1.0 / SIGNIFICANT_WIDTH).any())
+        carried_m_s = math.dist(geometry.drift_m_s, old.drift_m_s)
+        resized = (width < SIGNIFICANT_WIDTH) | (width > 1.0 / SIGNIFICANT_WIDTH)
+        return bool(moved.any() or resized.any()) or carried_m_s > SIGNIFICANT_STD * self._filter.drift_std_m_s
 
     def _new_messages(self) -> tuple[str, ...]:
         """Sentences on what the filter noticed since the last time."""
@@ -128,7 +133,11 @@ class FastAdaptation:
             found.append("adapt: the robot moves differently from what was learnt; learning again")
         if self._filter.carried > self._carried:
             found.append("adapt: the robot was carried")
+        if self._filter.on_slope != self._on_slope:
+            by = f"by {math.hypot(*self._filter.drift_m_s):.3f} m/s, as a slope does"
+            found.append(f"adapt: the ground carries the robot {by if self._filter.on_slope else 'no more'}")
         self._changes, self._carried = self._filter.changes, self._filter.carried
+        self._on_slope = self._filter.on_slope
         self._counts["changes"], self._counts["carried"] = self._changes, self._carried
         return tuple(found)
 
@@ -149,4 +158,4 @@ def change_record(now_ns: int, source: str, geometry: Geometry | None, why: str)
     if geometry is None:
         return records.BeliefChange(now_ns, source, reason=why)
     mean, covariance = tuple(geometry.mean.tolist()), tuple(geometry.covariance.ravel().tolist())
-    return records.BeliefChange(now_ns, source, NAMES, mean, covariance, why)
+    return records.BeliefChange(now_ns, source, NAMES, mean, covariance, why, *geometry.drift_m_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,16 +23,23 @@ NAMES = ("x_icr_m", "wheel_radius_m", "axial_distance_m")
 """Order of the geometry in arrays and in records."""
 REQUESTED_BY_FILE = "control.adaptation"
 
+LARGEST_DRIFT_M_S = 0.2
+"""Chosen: on a slope that carries a robot faster its tyres hardly hold it."""
+
 _LEAST_VARIANCE, _LARGEST_VARIANCE, _LEAST_EIGENVALUE = 1e-14, 1e4, 1e-9
 """Variances in m^2, and the smallest eigenvalue of a correlation matrix, that a float64 filter can still hold."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Geometry:
-    """A Gaussian over the geometry in the order of `NAMES`: `mean` (3,), `covariance` (3, 3)."""
+    """A Gaussian over the geometry in the order of `NAMES`: `mean` (3,), `covariance` (3, 3).
+
+    `drift_m_s`: how fast the ground carries the moving robot along x and y of the world, as on a slope.
+    """
 
     mean: Array
     covariance: Array
+    drift_m_s: tuple[float, float] = (0.0, 0.0)
 
     @property
     def std(self) -> Array:
@@ -45,8 +53,11 @@ def geometry_fault(geometry: Geometry, low: Array, high: Array) -> str:
     `low` and `high` (3,) bound the mean: the prior of robot.toml.
     """
     mean, covariance = geometry.mean, geometry.covariance
-    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+    drift_m_s = math.hypot(*geometry.drift_m_s)
+    if not (np.isfinite(mean).all() and np.isfinite(covariance).all() and math.isfinite(drift_m_s)):
         return "the estimate is not finite"
+    if drift_m_s > LARGEST_DRIFT_M_S:
+        return f"the ground would carry the robot by {drift_m_s:.2f} m/s, more than {LARGEST_DRIFT_M_S:g}"
     variances = np.diag(covariance)
     if not ((variances > _LEAST_VARIANCE) & (variances < _LARGEST_VARIANCE)).all():
         return "the estimate has no covariance"
@@ -105,6 +116,10 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
         why += "; remove pose.rate_hz, which decides nothing any more and will be refused later"
     if requested == "off":
         return AdaptationChoice("off", why)
+    if control.disturbance:
+        why += (
+            "; remove control.disturbance, without which the robot stays nearer to its line; it will be refused later"
+        )
     if requested == "audited":
         why += '; write "fast": its second estimator was no better and is gone'
     try:
@@ -149,4 +164,5 @@ def geometry_of(change: BeliefChange) -> Geometry | None:
     """Return the geometry of a recorded change, None for the model file's."""
     if change.source == "model":
         return None
-    return Geometry(np.array(change.mean), np.array(change.covariance).reshape(3, 3))
+    drift_m_s = change.drift_x_m_s, change.drift_y_m_s
+    return Geometry(np.array(change.mean), np.array(change.covariance).reshape(3, 3), drift_m_s)

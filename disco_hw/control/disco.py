@@ -62,7 +62,7 @@ class Disco:
         self.task, self.settings, self._surroundings = task, settings, surroundings
         self._points = points = RolloutPoints(model, settings, limits, seed)
         self._limits = limits
-        self._compensation = DisturbanceCompensation(points, settings.offset_free)
+        self._compensation = DisturbanceCompensation(points, settings)
         self._prediction = StatePrediction(points, self._compensation, settings, limits)
         sampler, change = settings.sampler, limits.acceleration_rad_s2 * settings.step_s
         self.optimiser = Optimiser(

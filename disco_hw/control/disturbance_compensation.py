@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from disco_hw.control.plan import Array, PlannerState, command_history
+from disco_hw.control.plan import Array, DiscoSettings, PlannerState, command_history
 from disco_hw.control.rollout_points import RolloutPoints
 from disco_hw.control.wheel_loss import WheelLoss
 from disco_hw.model.coefficients import NO_DISTURBANCE, NO_SLIDE
@@ -16,10 +16,14 @@ from disco_hw.model.step import FreeRun
 
 
 class DisturbanceCompensation:
-    """Follows the disturbance from plan to plan; where `is_on` is false the robot counts as undisturbed."""
+    """Follows the disturbance from plan to plan.
 
-    def __init__(self, points: RolloutPoints, is_on: bool) -> None:
-        self._points, self._is_on = points, is_on
+    Of one that is not estimated in full only the `slide` counts, and nothing where neither is.
+    """
+
+    def __init__(self, points: RolloutPoints, settings: DiscoSettings) -> None:
+        self._points = points
+        self._is_full, self._slides = settings.offset_free, settings.offset_free or settings.refine
         self._loss = WheelLoss()
         self._disturbance = NO_DISTURBANCE
         self.slide: Array = NO_SLIDE
@@ -37,9 +41,10 @@ class DisturbanceCompensation:
 
     def follow(self, now_ns: int, state: PlannerState) -> None:
         """Take the state's disturbance, and what the wheels have lost of their commands since the last plan."""
-        if not self._is_on:
+        if self._slides:
+            self._disturbance, self.slide = state.disturbance, state.disturbance.slides
+        if not self._is_full:
             return
-        self._disturbance, self.slide = state.disturbance, state.disturbance.slides
         self._loss.step(now_ns, state, self._wheels_after)
         self.is_none = self._disturbance.is_none and self._loss.is_none
 

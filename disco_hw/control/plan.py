@@ -22,11 +22,12 @@ from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION = 4
+PLANNER_VERSION, SAME_SINCE_VERSION = 5, 4
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
 1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
-weights, and shorter steps below 0.2 m/s. 4: along a line of way-points tabulated twice as finely.
+weights, and shorter steps below 0.2 m/s. 4: along a line of way-points tabulated twice as finely. 5: against the ground
+that carries the robot, where the log's beliefs say so: logs since `SAME_SINCE_VERSION` are replayed alike.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter

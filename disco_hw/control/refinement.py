@@ -8,13 +8,14 @@ several points does not know: it leaves the line on the side where their spread 
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.control.kernel import START_COS, START_SIN, START_X, START_Y, Terms
+from disco_hw.control.kernel import CARRIED_X, CARRIED_Y, START_COS, START_SIN, START_X, START_Y, Terms
 from disco_hw.control.kernel.guide import SteeredChassis, timed_reference
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, Problem, refine
 from disco_hw.control.parameter_points import mean_point
@@ -25,6 +26,8 @@ from disco_hw.model import Model
 from disco_hw.model.added_terms import new_means
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_series
+from disco_hw.tasks.line import SHARP_RAD
+from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
 
 Array = NDArray[np.float64]
 
@@ -42,8 +45,15 @@ ACCELERATION_M = 6e-4
 END_X_ICR = 5.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 LATERAL_PART, FACING = 0.3, 0.5
+# And so many times as far more as the ground carries it within the horizon: sampled plans do not know of that, and stay
+# aside.
+CARRIED_TIMES = 2.0
 # Behind a place that moves by itself it may be as far as that goes within the horizon: sampled plans do not catch up.
 TIMED_PART = 1.0
+# The line so many times x_icr behind the horizon, in so many pieces, decides how a robot faces that the ground carries.
+BEYOND_X_ICR, BEYOND = 4.0, 12
+# Two points of the line that are as near as this are one.
+SMALLEST_WAY_M = 1e-4
 # A robot that, in the mean over the last horizon, covers less than this part of its way is left to the sampled plan: a
 # reference that starts anew beside the robot lets a plan put off its way from tick to tick. And one that starts from
 # rest would be turned on the spot to where the line begins, as fast as its wheels can.
@@ -60,6 +70,7 @@ class Refinement:
         self._series = integration_series(settings.step_s, wide=True)
         self._reference = np.zeros((self._rows.size, CHANNELS), np.float32)
         self._found = np.ones(6, np.float32)
+        self._beyond = np.zeros((BEYOND + 1, CHANNELS), np.float32)
         self._start, self._before = np.zeros(5), np.zeros(CHANNELS)
         self._compiled: dict[str, Callable[..., float]] = {}
         self._last: Array | None = None
@@ -114,7 +125,8 @@ class Refinement:
         covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
         progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
         part = TIMED_PART if is_timed else LATERAL_PART
-        is_beside = distance_m < max(part * way_m, 0.02) and facing > FACING
+        carried_m = CARRIED_TIMES * self._rows.size * math.hypot(start[CARRIED_X], start[CARRIED_Y])
+        is_beside = distance_m < max(part * way_m, 0.02) + carried_m and facing > FACING
         if not moves or progress < LEAST_PROGRESS or not is_beside:
             return None
         buffers.commands[: self._history] = begin.earlier
@@ -130,14 +142,20 @@ class Refinement:
 
     def _set_reference(self, terms: Terms, start: NDArray[np.float32]) -> bool:
         """Set the reference, and what else is found on the task's line; returns whether it goes anywhere."""
+        carried_m = complex(start[CARRIED_X], start[CARRIED_Y])
+        x_icr_m = self._chassis.x_icr_m
         if hasattr(terms, "line_at"):
             self._call(
                 "timed reference", timed_reference, self._reference, terms, start, self._chassis,
-                self._limits.speed_rad_s, self._step_s, self._found,
+                self._limits.speed_rad_s, self._step_s, self._found, self._beyond, BEYOND_X_ICR / BEYOND * x_icr_m,
             )  # fmt: skip
+            if carried_m and x_icr_m > SMALLEST_X_ICR_M:
+                last_m = math.dist(*self._reference[-2:].tolist())
+                turned = complex(*self._found[3:5].tolist()) * turn_against(self._beyond, last_m, carried_m, x_icr_m)
+                self._found[3:5] = turned.real, turned.imag
             return True
         # The task is a reference in time, and its origin is where the robot should be now.
-        headings = terms.headings(self._chassis.x_icr_m)
+        headings = terms.headings(x_icr_m, carried_m)
         self._reference[:, 0], self._reference[:, 1] = terms.x[: self._rows.size], terms.y[: self._rows.size]
         if headings is None:
             return False
@@ -168,6 +186,27 @@ class Refinement:
         if entry is None:
             entry = self._compiled[name] = compiled_for(kernel, *arguments)
         return entry(*arguments)
+
+
+def turn_against(line_m: NDArray[np.float32], step_m: float, carried_m: complex, x_icr_m: float) -> complex:
+    """Return by how much the heading at the begin of a line (N, 2) differs where the ground carries the robot.
+
+    As a complex number of size 1. The robot goes `step_m` along the line while the ground carries it `carried_m`. Its
+    own way makes up for that, and its heading stays on this way (`stable_yaw`).
+    """
+    ways = np.diff(line_m.astype(np.float64) @ (1.0, 1j))
+    lengths_m = np.abs(ways)
+    turns_rad = np.abs(np.angle(ways[1:] * ways[:-1].conj()))
+    # As in the task's table, what comes behind the line's end or a sharp turn says nothing of the heading before.
+    ends = np.flatnonzero((lengths_m[1:] < SMALLEST_WAY_M) | (turns_rad > SHARP_RAD))
+    ways, lengths_m = ways[: ends[0] + 1] if ends.size else ways, lengths_m[: ends[0] + 1] if ends.size else lengths_m
+    if min(lengths_m[0], step_m) < SMALLEST_WAY_M:
+        return 1.0
+    own = ways - carried_m * lengths_m / step_m
+    with_ground, without = (
+        stable_yaw(np.unwrap(np.angle(one)), np.abs(one), x_icr_m, closed=False)[0] for one in (own, ways)
+    )
+    return cmath.rect(1.0, with_ground - without)
 
 
 class CoveredWay:

@@ -173,7 +173,8 @@ class BeliefChange(msgspec.Struct, frozen=True, gc=False):
     """The belief over parameters that planner and estimator use from this tick on.
 
     `source` is "adapted" for one learnt from the running drive, or "model" for the model file's again, with empty
-    arrays. `covariance` is row-major in the order of `names`, SI units.
+    arrays. `covariance` is row-major in the order of `names`, SI units. `drift_x_m_s`, `drift_y_m_s`: how fast the
+    ground carries the moving robot in the world frame, as on a slope.
     """
 
     t_ns: int
@@ -182,6 +183,8 @@ class BeliefChange(msgspec.Struct, frozen=True, gc=False):
     mean: tuple[float, ...] = ()
     covariance: tuple[float, ...] = ()
     reason: str = ""
+    drift_x_m_s: float = 0.0
+    drift_y_m_s: float = 0.0
 
 
 class Adaptation(msgspec.Struct, frozen=True, gc=False):

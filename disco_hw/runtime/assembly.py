@@ -144,7 +144,6 @@ def create_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
         _rehearsed(setup, pipeline),
         *possible_range(setup.config.prior),
         lambda geometry: apply_geometry(pipeline, setup.model, geometry),
-        setup.config.control.disturbance,
     )
 
 
@@ -165,7 +164,8 @@ def apply_geometry(pipeline: Pipeline, model: Model, geometry: Geometry | None) 
     adapted = model if geometry is None else with_geometry(model, geometry)
     if adapted.belief is None:
         raise ValueError("the model has no belief")
-    pipeline.set_belief(adapted.belief, odometry_parameters(adapted))
+    drift_m_s = (0.0, 0.0) if geometry is None else geometry.drift_m_s
+    pipeline.set_belief(adapted.belief, odometry_parameters(adapted), drift_m_s)
 
 
 def odometry_parameters(model: Model) -> OdometryParameters:

@@ -298,6 +298,7 @@ class Pipeline:
         self.headings = headings or HeadingWatch([one.label for one in fusion.sources.all])
         self._means = means
         self._disturbance = disturbance
+        self._drift = NO_DISTURBANCE
         self._planner = planner
         self._governor = governor
         self._plan_tail_ns = round(plan_tail_s * 1e9)
@@ -309,8 +310,8 @@ class Pipeline:
 
     @property
     def disturbance(self) -> Disturbance:
-        """Estimated motion of the robot beside its model; no disturbance where none is estimated."""
-        return NO_DISTURBANCE if self._disturbance is None else self._disturbance.value
+        """Estimated motion of the robot beside its model: all of it, or the drift that came with the belief."""
+        return self._drift if self._disturbance is None else self._disturbance.value
 
     def set_task(self, task: PlannedTask, line_m: NDArray[np.float64] | None = None) -> None:
         """Follow another task of the same kind; what is planned for the present one is dropped.
@@ -322,15 +323,22 @@ class Pipeline:
             self._avoids.set_line(line_m)
         self._plan, self._following = None, False
 
-    def set_belief(self, belief: Belief, odometry: OdometryParameters) -> None:
+    def set_belief(
+        self, belief: Belief, odometry: OdometryParameters, drift_m_s: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
         """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
 
-        Raises ValueError, with everything as it was, if the planner cannot take the belief.
+        `drift_m_s`: how fast the ground carries the moving robot along x and y of the world; it does not count where a
+        disturbance is estimated. Raises ValueError, with everything as it was, if the planner cannot take the belief.
         """
         self._planner.set_belief(belief)
         if self._disturbance is not None:
             self._disturbance.change_geometry(self.fusion.parameters, odometry, self.fusion.wheels_rad_s)
-            self.fusion.set_disturbance(self._disturbance.value)
+        elif drift_m_s == (0.0, 0.0):
+            self._drift = NO_DISTURBANCE
+        else:
+            self._drift = Disturbance(drift_x_m_s=drift_m_s[0], drift_y_m_s=drift_m_s[1])
+        self.fusion.set_disturbance(self.disturbance)
         self.fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:

@@ -14,7 +14,7 @@ import msgspec
 
 from disco_hw.adaptation.guard import geometry_of
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import PLANNER_VERSION
+from disco_hw.control.plan import PLANNER_VERSION, SAME_SINCE_VERSION
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.log.mcap_log import Metadata
@@ -160,7 +160,7 @@ def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata, has_plans
             f"{PLANNER_VERSION}; replay it with disco-hw {recorded.version or 'of the version that recorded it'}"
         )
     control = setup.config.control
-    if planner == PLANNER_VERSION or control.mode != "default" or not has_plans:
+    if planner >= SAME_SINCE_VERSION or control.mode != "default" or not has_plans:
         return setup
     if planner > 1:
         raise InputError(

@@ -219,10 +219,11 @@ class TimedPathTerms(NamedTuple):
         """Return zero, because there is no terminal cost."""
         return _ZERO
 
-    def headings(self, x_icr_m: float) -> Array | None:
+    def headings(self, x_icr_m: float, carried_m: complex = 0.0) -> Array | None:
         """Headings (T + 1,), rad, in which a robot stays with the place, at each step's begin and the last one's end.
 
-        None while the place rests throughout. Python only.
+        `carried_m`: how far the ground carries the moving robot in a step, along x and y. None while the place rests
+        throughout. Python only.
         """
         x, y = np.diff(self.x, prepend=np.float32(0.0)), np.diff(self.y, prepend=np.float32(0.0))
         (moves,) = np.nonzero(self.along_x**2 + self.along_y**2)
@@ -231,4 +232,8 @@ class TimedPathTerms(NamedTuple):
         # A place that rests has the direction in which it goes on.
         along = np.arctan2(self.along_y, self.along_x)[moves]
         after = np.minimum(np.searchsorted(moves, np.arange(self.x.size)), moves.size - 1)
-        return stable_yaw(np.unwrap(along.astype(np.float64))[after], np.hypot(x, y), x_icr_m, False)
+        length_m = np.hypot(x, y)
+        if carried_m:
+            own = length_m[moves] * np.exp(1j * along.astype(np.float64)) - carried_m
+            along, length_m[moves] = np.angle(own), np.abs(own)
+        return stable_yaw(np.unwrap(along.astype(np.float64))[after], length_m, x_icr_m, False)

@@ -77,6 +77,7 @@ def test_old_entries_are_read_and_named():
         slow = choose_adaptation(Control(adaptation=adaptation), PoseInput(rate_hz=2.0), MODEL)
         assert slow.kind == ("fast" if adaptation == "auto" else "off")
         assert "remove pose.rate_hz" in slow.report
+    assert "remove control.disturbance" in choose_adaptation(Control(disturbance=True), PoseInput(), MODEL).report
 
 
 def test_the_range_is_the_prior_as_far_as_it_is_possible():
@@ -109,4 +110,13 @@ TOO_CORRELATED = GOOD_COVARIANCE + 1.01 * (0.02**2 * MEAN[0] * MEAN[1]) * np.arr
 )
 def test_an_estimate_with_a_fault_is_named(mean, covariance, fault):
     found = geometry_fault(Geometry(np.asarray(mean), covariance), LOW, HIGH)
+    assert re.search(fault, found) if fault else found == ""
+
+
+@pytest.mark.parametrize(
+    ("drift_m_s", "fault"),
+    [((0.1, -0.15), ""), ((0.18, -0.15), r"by 0\.23 m/s, more than 0\.2"), ((np.nan, 0.0), "finite")],
+)
+def test_ground_that_carries_a_robot_too_fast_is_not_planned_with(drift_m_s, fault):
+    found = geometry_fault(Geometry(MEAN, GOOD_COVARIANCE, drift_m_s), LOW, HIGH)
     assert re.search(fault, found) if fault else found == ""

@@ -4,12 +4,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
+from msgspec import structs
 
 from disco_hw.adaptation import NoAdaptation
 from disco_hw.adaptation.fast import FastAdaptation
 from disco_hw.adaptation.guard import Geometry, believed_geometry
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
-from disco_hw.log.records import Adaptation, BeliefChange
+from disco_hw.log.records import Adaptation, BeliefChange, Event
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import load_setup
@@ -18,6 +20,10 @@ from sim.plant_parameters import PlantParameters
 from tools.foreign_plant import NOMINAL, ForeignPlant, robots
 
 ROBOT = Path(__file__).parents[2] / "disco_hw" / "robots" / "wombot.toml"
+
+
+# Of the ground: m/s, and which way (rad).
+DRIFT = (0.03, 1.2)
 
 
 def short_sighted(directory):
@@ -34,7 +40,7 @@ def driven(directory, seconds):
     plant = replace(
         PlantParameters(ticks_per_rev=2048), x_icr_m=x_icr, wheel_radius_m=0.88 * radius, axial_distance_m=1.12 * axial
     )
-    robot = virtual_robot(setup, plant, BodyPose(0.75, 0.0, 1.57), seed=1)
+    robot = virtual_robot(setup, plant, BodyPose(0.75, 0.0, 1.57), effects={"slope": DRIFT}, seed=1)
     run = SimulatedRun(setup, robot, create_planner(setup.config, setup.model))
     run.start()
     run.run(seconds)
@@ -51,11 +57,18 @@ def test_the_geometry_is_learnt_logged_and_taken_back_when_asked(tmp_path):
     assert adaptation.status()["belief"] == "adapted"
     assert len(changes(run)) > 3
     np.testing.assert_allclose(changes(run)[-1].mean, truth, rtol=0.05)
+    drift = DRIFT[0] * np.exp(1j * DRIFT[1])
+    assert changes(run)[-1].drift_x_m_s == pytest.approx(drift.real, abs=0.01)
+    assert changes(run)[-1].drift_y_m_s == pytest.approx(drift.imag, abs=0.01)
+    assert adaptation.status()["drift_m_s"] == pytest.approx([drift.real, drift.imag], abs=0.01)
+    told = [event.text for _, tick in run.recorder.ticks for event in tick if isinstance(event, Event)]
+    assert any("the ground carries the robot by 0.0" in text for text in told)
 
     assert adaptation.handle_request("revert")[0]
     run.run(1.2)
     assert adaptation.status()["belief"] == "model"
     assert changes(run)[-1].source == "model"
+    assert run.core.pipeline.disturbance.is_none
     assert adaptation.handle_request("adapt")[0]
     run.run(1.6)
     assert adaptation.status()["belief"] == "adapted"
@@ -64,6 +77,17 @@ def test_the_geometry_is_learnt_logged_and_taken_back_when_asked(tmp_path):
     report = replay(tmp_path / "drive.mcap")
     assert report.ok, report.as_text()
     assert report.ticks > 500
+
+    # The drift is planned and estimated with: without it the replay is another drive.
+    still = [
+        (now, [structs.replace(one, drift_y_m_s=0.0) if isinstance(one, BeliefChange) else one for one in tick])
+        for now, tick in run.recorder.ticks
+    ]
+    run.recorder.ticks[:] = still
+    run.write_log(tmp_path / "still.mcap")
+    difference = replay(tmp_path / "still.mcap").difference
+    assert difference is not None
+    assert difference.field.startswith("Estimate.")
 
 
 MEAN = np.array(NOMINAL)[[2, 0, 1]]

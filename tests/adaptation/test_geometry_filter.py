@@ -168,6 +168,31 @@ def test_the_intervals_hold_what_they_say(seconds):
     assert (np.mean(inside, axis=0) >= 0.85).all()
 
 
+@pytest.mark.parametrize("drift_m_s", [0.02, pytest.param(-0.01, marks=pytest.mark.thorough)])
+def test_ground_that_carries_the_robot_is_told_from_its_geometry_and_so_is_level_ground_again(drift_m_s):
+    found, plant = learner(), ForeignPlant(robots(200, 1)[0], (0.0, 0.0, 0.3), 1)
+    changed(plant, slope_m_s=drift_m_s)
+    drive(found, plant, TURN, 20.0)
+    assert found.on_slope
+    # The plant is carried against y.
+    assert found.drift_m_s == pytest.approx((0.0, -drift_m_s), abs=0.002)
+    assert found.drift_std_m_s < 0.002
+    assert np.abs(found.mean / truth(plant.robot) - 1.0).max() < 0.03
+    changed(plant, slope_m_s=0.0)
+    drive(found, plant, TURN, 20.0)
+    assert found.drift_m_s == pytest.approx((0.0, 0.0), abs=0.002)
+    assert np.abs(found.mean / truth(plant.robot) - 1.0).max() < 0.03
+
+
+@pytest.mark.parametrize("command", [TURN, pytest.param(STRAIGHT, marks=pytest.mark.thorough)])
+def test_level_ground_carries_nobody(command):
+    found, plant = settled(5)
+    for _ in range(50):
+        drive(found, plant, command, 0.4)
+        assert not found.on_slope
+    assert found.drift_m_s == (0.0, 0.0)
+
+
 def test_wheels_without_poses_are_not_kept_and_the_filter_learns_afterwards():
     found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
     for _ in range(500):

@@ -1,8 +1,9 @@
-"""Tests that the robot, with true parameters, drives its circle without offset, at any speed, rate and radius."""
+"""Tests that the robot drives without offset: with true parameters at any speed, rate and radius, and on a slope."""
 
 import math
 
 import numpy as np
+import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState, SentCommand
 from disco_hw.experiments.circle import KinematicPlant
@@ -10,6 +11,8 @@ from disco_hw.model import Gaussian, Model
 from disco_hw.model.model import EffectSetting
 from disco_hw.tasks.circle import CircleCost
 from tests.tables import thinned
+from tools.foreign_plant import robots
+from tools.tracking import disco, drive, tracks
 
 THETA = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
 MEAN = np.array(list(THETA.values()))
@@ -46,3 +49,17 @@ def test_the_circle_is_driven_without_an_offset(rate_hz, speed_m_s):
         # At ten plans a second the robot turns by a third of a radian between two plans on the smallest at 0.6 m/s.
         limit_m = 0.003 if (rate_hz, speed_m_s, radius_m) == (10.0, 0.6, 0.3) else 0.002
         assert abs(mean_distance_m(settings, rate_hz, speed_m_s, radius_m)) < limit_m, radius_m
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("way", ["circle", "eight"])
+def test_a_slope_whose_pull_is_learnt_leaves_no_offset(way):
+    """A slope that carries the robot by 15 % of its speed; what is not learnt of it leaves 40 to 60 mm."""
+    robot = robots(3000, 1, slope_m_s=0.03)[0]
+    settings = DiscoSettings.for_speed(0.2, 50.0)
+    off_mm = [
+        drive(disco(settings, knows=not learns, learns=learns), robot, tracks()[way]).after(18.0).rms_mm
+        for learns in (True, False)
+    ]
+    assert off_mm[0] < 4.0
+    assert off_mm[1] > 30.0

@@ -11,7 +11,7 @@ from msgspec import structs
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.control.parameter_points import mean_point
-from disco_hw.control.refinement import ACCELERATION_M, END_X_ICR, STEPS
+from disco_hw.control.refinement import ACCELERATION_M, END_X_ICR, STEPS, turn_against
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -135,6 +135,46 @@ def test_plans_are_refined_except_in_two_modes() -> None:
     assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), DiscoSettings(), LIMITS).refinement is not None
     for settings in (DiscoSettings.paper(), DiscoSettings(refine=False), DiscoSettings(offset_free=True)):
         assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), settings, LIMITS).refinement is None
+
+
+def _carried_heading(carried_m_s: complex, speed_m_s: float, begin_rad: float) -> float:
+    """Heading at an angle of the circle that keeps a carried robot on it: integrated backwards from a lap further on.
+
+    The way of the tracked point across the body is x_icr times the turn, to the right of a robot that turns left.
+    """
+    step_s = 1e-3
+    angles = begin_rad + speed_m_s / RADIUS_M * step_s * np.arange(round(2.0 * math.pi * RADIUS_M / speed_m_s / step_s))
+    own = speed_m_s * 1j * np.exp(1j * angles) - carried_m_s
+    yaw = float(np.angle(own[-1]))
+    for velocity in own[::-1]:
+        across = (velocity * np.exp(-1j * yaw)).imag
+        yaw -= -across / X_ICR_M * step_s
+    return yaw
+
+
+@pytest.mark.parametrize("begin_rad", [0.5, 1.0, 2.5, 4.0])
+def test_the_last_heading_is_turned_against_the_ground_that_carries_the_robot(begin_rad: float) -> None:
+    """By as much as the robot has to be turned to stay on a circle, and on a straight line by the angle of its ways."""
+    speed_m_s, carried_m_s, step_s = 0.2, 0.03 * complex(0.6, -0.8), 0.1
+    along_m = np.linspace(0.0, 4.0 * X_ICR_M, 13)
+    angles = begin_rad + along_m / RADIUS_M
+    circle = np.column_stack([RADIUS_M * np.cos(angles), RADIUS_M * np.sin(angles)]).astype(np.float32)
+    turn = turn_against(circle, speed_m_s * step_s, carried_m_s * step_s, X_ICR_M)
+    expected = _carried_heading(carried_m_s, speed_m_s, begin_rad) - _carried_heading(0.0, speed_m_s, begin_rad)
+    assert abs(expected) > 0.02
+    assert math.atan2(turn.imag, turn.real) == pytest.approx(math.remainder(expected, 2.0 * math.pi), abs=0.012)
+    straight = np.column_stack([along_m, 0.0 * along_m]).astype(np.float32)
+    turn = turn_against(straight, speed_m_s * step_s, 0.03j * step_s, X_ICR_M)
+    assert math.atan2(turn.imag, turn.real) == pytest.approx(-math.atan2(0.03, speed_m_s), abs=1e-3)
+
+
+def test_a_robot_is_not_turned_for_what_comes_behind_a_sharp_turn_or_the_end() -> None:
+    """As the task's table has it: the robot stops there."""
+    there = np.column_stack([np.linspace(0.0, 0.4, 5), np.zeros(5)]).astype(np.float32)
+    expected = turn_against(there, 0.02, 0.003j, X_ICR_M)
+    for behind in (there[::-1], np.repeat(there[-1:], 5, axis=0)):
+        assert turn_against(np.vstack([there, behind[1:]]), 0.02, 0.003j, X_ICR_M) == pytest.approx(expected)
+    assert turn_against(np.repeat(there[-1:], 5, axis=0), 0.02, 0.003j, X_ICR_M) == 1.0
 
 
 def test_a_robot_that_gets_nowhere_is_left_to_the_sampled_plan() -> None:

@@ -55,6 +55,11 @@ def test_the_heading_is_that_of_a_robot_that_stays_with_the_place():
     settled = np.arange(60)
     np.testing.assert_allclose(goes_on[:60], turned + settled * 0.1 / 4.0, atol=0.02)
     np.testing.assert_allclose(rests[:50], goes_on[0], atol=0.02)
+    # Ground that carries it by a tenth of its way, across, is made up for by as large an angle.
+    ahead = Waypoints(np.array([[0.0, 0.0], [9.0, 0.0]]), np.array([0.0, 90.0]))
+    terms = TimedPathCost(ahead).prepare(5.0, 0.0, 0.0, 0.0, None, 0.1, 40).terms
+    np.testing.assert_allclose(terms.headings(x_icr_m, 0.001j), -math.atan(0.1), atol=1e-3)
+    np.testing.assert_allclose(terms.headings(x_icr_m), 0.0, atol=1e-3)
     still = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0]]), np.array([50.0, 60.0]))
     assert TimedPathCost(still).prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 40).terms.headings(x_icr_m) is None
 

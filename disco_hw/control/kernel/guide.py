@@ -140,13 +140,14 @@ def _beyond(command: float, dead: float) -> float:
 @kernel_function
 def timed_reference(
     reference: Floats, terms: Terms, start: Floats, chassis: SteeredChassis, largest_rad_s: float, step_s: float,
-    found: Floats,
+    found: Floats, beyond: Floats, beyond_m: float,
 ) -> None:  # fmt: skip
     """Fill `reference` (T, 2) with points (m), relative to the task's origin.
 
     `start` (11,) is the state of `SkidSteer`. Sets `found` (6,): distance to the line (m), cosine of the angle between
     the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do,
     at most 1, that heading at the end (cosine, sine), and the length of the way from the first point to the last (m).
+    And `beyond` (N, 2): that last point, and those behind it along the line, `beyond_m` apart.
     """
     x, y, cos_yaw, sin_yaw = start[START_X], start[START_Y], start[START_COS], start[START_SIN]
     place = place_of(terms, start[START_MEMORY], x, y)
@@ -172,3 +173,5 @@ def timed_reference(
             way_m += math.hypot(at_x - reference[t - 1, 0], at_y - reference[t - 1, 1])
     found[2] = ahead / requested if requested > 0.0 else 1.0
     found[3], found[4], found[5] = head_x, head_y, way_m
+    for n in range(beyond.shape[0]):
+        beyond[n, 0], beyond[n, 1], _, _, _, _ = line_at(terms, place, ahead + n * beyond_m)
