@@ -21,7 +21,7 @@ from drivers.samples import FARTHEST_M
 # Chosen: smaller follows corners more closely, which refined plans are exact enough for, and makes the table longer.
 SPACING_M = 0.02
 REFINED_SPACING_M = 0.01
-# Chosen: each new belief of x_icr goes once through the whole table, within a tick; longer paths are as coarse as ever.
+# Chosen: longer paths are as coarse as ever. Nothing needs that any more but the replay of logs of such paths.
 MOST_REFINED = 5000
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01

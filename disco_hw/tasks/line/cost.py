@@ -219,7 +219,7 @@ def _nearby(path: PathTable, block: int, reach: int, x_icr_m: float) -> _Nearby:
     # An open path's last entry is one of its own: it is not the first.
     origin = table[block * NEAR % count if path.closed else block * NEAR, :2]
     pieces = np.hstack([here - origin, there - here]).astype(np.float32)
-    turned = turned_sines(path, x_icr_m)[at].astype(np.float32)
+    turned = turned_sines(path, x_icr_m, first, end).astype(np.float32)
     x_m, y_m = origin.tolist()
     return _Nearby(pieces.reshape(-1), turned.reshape(-1), first, (x_m, y_m))
 

@@ -252,7 +252,7 @@ def _turn_back(path: PathTable, heading: Array, turned_rad: float, least_m: floa
 
 # Chosen: the heading's equation grows stiff towards 0, where its solution is the line's direction.
 SMALLEST_X_ICR_M = 0.01
-# Chosen: over so many times x_icr the heading of a closed line forgets where it began, but for rounding.
+# Chosen: what is so many times x_icr further along the line changes a heading by no more than rounding does.
 _FORGETS_X_ICR = 40.0
 
 
@@ -287,19 +287,26 @@ def stable_yaw(along_rad: Array, spacing_m: float | Array, x_icr_m: float, close
     return np.array(yaw)
 
 
-@lru_cache(maxsize=8)
-def turned_sines(path: PathTable, x_icr_m: float) -> Array:
-    """Sine by which the robot is turned from every piece at its begin, and how much more at its end: (M, 2)."""
-    along = np.unwrap(np.arctan2(path.table[:-1, 3], path.table[:-1, 2]))
-    count = along.size
-    turned = np.empty((count, 2))
+def turned_sines(path: PathTable, x_icr_m: float, first: int, end: int) -> Array:
+    """Sine by which the robot is turned from each piece of a part at its begin, and how much more at its end: (M, 2).
+
+    Of the pieces `first` to `end` - 1, which on a closed path may be counted beyond its table. The line further on
+    counts as far as the heading remembers it.
+    """
+    count = len(path.table) - 1
+    remembered = math.ceil(_FORGETS_X_ICR * abs(x_icr_m) / path.spacing_m)
+    # Which way the heading depends on the line.
+    begin, stop = (first, end + remembered) if x_icr_m > 0.0 else (first - remembered, end)
+    if not path.closed:
+        begin, stop = max(begin, 0), min(stop, count)
+    at = np.arange(begin, stop)
+    along = np.unwrap(np.arctan2(path.table[at % count, 3], path.table[at % count, 2]))
+    turned = np.empty((at.size, 2))
     # A robot stops where the path turns sharply: what comes after says nothing of the heading before.
-    bounds = (
-        [*path.sharp_turns, path.sharp_turns[0] + count] if path.closed and path.ends else [0, *path.sharp_turns, count]
-    )
-    for begin, end in pairwise(bounds):
-        at = np.arange(begin, end) % count
-        yaw = stable_yaw(np.unwrap(along[at]), path.spacing_m, x_icr_m, path.closed and not path.ends)
-        turned[at] = np.column_stack([yaw[:-1], yaw[1:]]) - np.unwrap(along[at])[:, None]
-    sines = np.sin(np.clip(turned, -0.5 * math.pi, 0.5 * math.pi))
+    sharp = np.flatnonzero(np.isin(at % count, path.sharp_turns))
+    for here, there in pairwise(sorted({0, *sharp.tolist(), at.size})):
+        yaw = stable_yaw(along[here:there], path.spacing_m, x_icr_m, False)
+        turned[here:there] = np.column_stack([yaw[:-1], yaw[1:]]) - along[here:there, None]
+    part = turned[first - begin : end - begin]
+    sines = np.sin(np.clip(part, -0.5 * math.pi, 0.5 * math.pi))
     return np.column_stack([sines[:, 0], sines[:, 1] - sines[:, 0]])

@@ -1,4 +1,4 @@
-"""Courses: distance and its sign, extent, length, start."""
+"""Courses: distance and its sign, extent, length, start, headings that stay on the line."""
 
 import math
 
@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from disco_hw.tasks.circle import CircleTask
+from disco_hw.tasks.line import PathTable
+from disco_hw.tasks.line.course import stable_yaw, turned_sines
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
 
@@ -64,3 +66,18 @@ def test_a_course_that_begins_with_a_rest_faces_where_it_goes():
     course = TimedPathTask(path="p.csv", points=points, times_s=(0.0, 1.0, 9.0)).course()
     assert course.start == pytest.approx((1.0, 0.0, 0.5 * math.pi))
     np.testing.assert_allclose(course.off_m(np.array([[1.2, 1.0]])), [0.2])
+
+
+@pytest.mark.parametrize("x_icr_m", [0.238, -0.238])
+@pytest.mark.parametrize("first", [-120, 0, 70, 333])
+def test_the_headings_along_a_part_of_a_line_are_those_along_all_of_it(x_icr_m, first):
+    angles = np.linspace(0.0, 2.0 * math.pi, 200)
+    path = PathTable(np.column_stack([np.cos(angles) + 0.3 * np.cos(2.0 * angles), np.sin(angles)]))
+    assert path.closed
+    count = len(path.table) - 1
+    along = np.unwrap(np.arctan2(path.table[:-1, 3], path.table[:-1, 2]))
+    yaw = stable_yaw(along, path.spacing_m, x_icr_m, True)
+    begin, end = np.sin(yaw[:-1] - along), np.sin(yaw[1:] - along)
+    at = np.arange(first, first + 100) % count
+    expected = np.column_stack([begin, end - begin])[at]
+    np.testing.assert_allclose(turned_sines(path, x_icr_m, first, first + 100), expected, atol=1e-12)
