@@ -10,9 +10,9 @@ or one, were opened at different times. One that has explained the poses since t
 how seldom a robot changes is believed from then on (a generalised likelihood ratio test for the time of a change,
 Willsky and Jones 1976; the least likely is replaced by a new one).
 
-Another one runs all the time, for which the ground carries the robot, as a slope does, if it is level for the one that
-is believed, or the other way round. It is believed once its evidence outweighs that ground seldom changes. So a change
-of the geometry on level ground is known as soon as if there were no slopes.
+Another one runs all the time, with the other ground: a slope, which carries the robot with a constant drift in the
+world frame, if the believed filter assumes level ground, and the reverse. It is believed once its evidence outweighs
+how seldom the ground changes. So on level ground a change of the geometry is known as soon as without this filter.
 
 What nothing excites stays as it is: a robot that stands gives no evidence at all, and the parameters may change only as
 far as the robot drives (the radius) or turns (the other two), so a straight line leaves axle and x_icr alone. When
@@ -83,7 +83,7 @@ _X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG, _DRIFT_X, _DRIFT_Y = 
 # Length of the state above.
 _SIZE = 11
 _DRIFTS = [_DRIFT_X, _DRIFT_Y]
-# Row of the filter that is believed, and of the one for which the ground is a slope if it is level for this one.
+# Rows of the filter that is believed, and of the one with the other ground.
 _BELIEVED, _OTHER_GROUND = 0, 1
 _THETA = slice(_RADIUS, _X_ICR + 1)
 _SLIPS = slice(_LEFT, _RIGHT + 1)
@@ -187,8 +187,8 @@ class _Bank:
         block = self.covariance[row, _THETA, _THETA]
         block += np.diag(np.maximum(widest**2 - np.diag(block), 0.0))
 
-    def change_ground(self, row: int) -> None:
-        """Let level ground be a slope for this row, or a slope level ground."""
+    def toggle_ground(self, row: int) -> None:
+        """Turn level ground into a slope of unknown drift for this row, or a slope into level ground."""
         is_level = not self.on_slope[row]
         self.state[row, _DRIFTS] = 0.0
         self.covariance[row, _DRIFTS] = self.covariance[row, :, _DRIFTS] = 0.0
@@ -362,7 +362,7 @@ class GeometryFilter:
             self._add_hypotheses()
             is_old = self._age_s[_OTHER_GROUND] > HYPOTHESIS_LASTS_S
             if is_old and self._log_odds[_OTHER_GROUND] == GROUND_LOG_ODDS:
-                self._doubt_ground()
+                self._restart_other_ground()
 
     def _follow_run(self, innovation: Array, expected: Array) -> None:
         """Take one innovation into the sum, and the sum into the mean of their sizes: 1 if they are independent."""
@@ -388,21 +388,21 @@ class GeometryFilter:
             self._bank.widen(row, self._widest() * kind)
 
     def _only(self, row: int) -> None:
-        """Believe this filter, and forget the others but that of the other ground."""
-        # What has just changed explains too much by a slope: the old doubt stays until it is old.
+        """Believe this filter, and drop the others except that of the other ground."""
+        # After a change of the geometry a new filter with a slope would explain too much: the old one stays.
         is_change = row > _OTHER_GROUND
         rows = np.array([row, _OTHER_GROUND if is_change else row])
         self._bank.keep(rows)
         self._log_odds, self._age_s, self._moved_s = self._log_odds[rows] - self._log_odds[row], self._age_s[rows], 0.0
         if not is_change:
-            self._doubt_ground()
+            self._restart_other_ground()
 
-    def _doubt_ground(self) -> None:
-        """Let the filter of the other ground begin anew where the robot is, of a robot that may have changed."""
+    def _restart_other_ground(self) -> None:
+        """Restart the filter of the other ground from the believed one, with the geometry opened."""
         rows = np.arange(len(self._log_odds))
         rows[_OTHER_GROUND] = _BELIEVED
         self._bank.keep(rows)
-        self._bank.change_ground(_OTHER_GROUND)
+        self._bank.toggle_ground(_OTHER_GROUND)
         self._bank.widen(_OTHER_GROUND, self._widest())
         self._log_odds[_OTHER_GROUND], self._age_s[_OTHER_GROUND] = GROUND_LOG_ODDS, 0.0
 

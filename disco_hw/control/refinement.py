@@ -45,12 +45,11 @@ ACCELERATION_M = 6e-4
 END_X_ICR = 5.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 LATERAL_PART, FACING = 0.3, 0.5
-# And so many times as far more as the ground carries it within the horizon: sampled plans do not know of that, and stay
-# aside.
-CARRIED_TIMES = 2.0
+# Plus so many times the drift within the horizon: sampled plans do not know of it, and stay that far from the line.
+DRIFT_MARGIN = 2.0
 # Behind a place that moves by itself it may be as far as that goes within the horizon: sampled plans do not catch up.
 TIMED_PART = 1.0
-# The line so many times x_icr behind the horizon, in so many pieces, decides how a robot faces that the ground carries.
+# Length of the line beyond the horizon, in x_icr, and pieces of it, from which the heading against a drift is found.
 BEYOND_X_ICR, BEYOND = 4.0, 12
 # Two points of the line that are as near as this are one.
 SMALLEST_WAY_M = 1e-4
@@ -125,7 +124,7 @@ class Refinement:
         covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
         progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
         part = TIMED_PART if is_timed else LATERAL_PART
-        carried_m = CARRIED_TIMES * self._rows.size * math.hypot(start[CARRIED_X], start[CARRIED_Y])
+        carried_m = DRIFT_MARGIN * self._rows.size * math.hypot(start[CARRIED_X], start[CARRIED_Y])
         is_beside = distance_m < max(part * way_m, 0.02) + carried_m and facing > FACING
         if not moves or progress < LEAST_PROGRESS or not is_beside:
             return None
@@ -151,7 +150,8 @@ class Refinement:
             )  # fmt: skip
             if carried_m and x_icr_m > SMALLEST_X_ICR_M:
                 last_m = math.dist(*self._reference[-2:].tolist())
-                turned = complex(*self._found[3:5].tolist()) * turn_against(self._beyond, last_m, carried_m, x_icr_m)
+                rotation = drift_correction(self._beyond, last_m, carried_m, x_icr_m)
+                turned = complex(*self._found[3:5].tolist()) * rotation
                 self._found[3:5] = turned.real, turned.imag
             return True
         # The task is a reference in time, and its origin is where the robot should be now.
@@ -188,11 +188,11 @@ class Refinement:
         return entry(*arguments)
 
 
-def turn_against(line_m: NDArray[np.float32], step_m: float, carried_m: complex, x_icr_m: float) -> complex:
-    """Return by how much the heading at the begin of a line (N, 2) differs where the ground carries the robot.
+def drift_correction(line_m: NDArray[np.float32], step_m: float, carried_m: complex, x_icr_m: float) -> complex:
+    """Return the rotation of the heading at the start of a line that compensates a drift, a unit complex number.
 
-    As a complex number of size 1. The robot goes `step_m` along the line while the ground carries it `carried_m`. Its
-    own way makes up for that, and its heading stays on this way (`stable_yaw`).
+    `line_m` (N, 2): points of the line. While the robot covers `step_m` of it the ground carries it by `carried_m`
+    (x + i y). Its own motion is the difference, and its heading the stable one along that (`stable_yaw`).
     """
     ways = np.diff(line_m.astype(np.float64) @ (1.0, 1j))
     lengths_m = np.abs(ways)

@@ -11,7 +11,7 @@ from msgspec import structs
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.control.parameter_points import mean_point
-from disco_hw.control.refinement import ACCELERATION_M, END_X_ICR, STEPS, turn_against
+from disco_hw.control.refinement import ACCELERATION_M, END_X_ICR, STEPS, drift_correction
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -159,22 +159,22 @@ def test_the_last_heading_is_turned_against_the_ground_that_carries_the_robot(be
     along_m = np.linspace(0.0, 4.0 * X_ICR_M, 13)
     angles = begin_rad + along_m / RADIUS_M
     circle = np.column_stack([RADIUS_M * np.cos(angles), RADIUS_M * np.sin(angles)]).astype(np.float32)
-    turn = turn_against(circle, speed_m_s * step_s, carried_m_s * step_s, X_ICR_M)
+    turn = drift_correction(circle, speed_m_s * step_s, carried_m_s * step_s, X_ICR_M)
     expected = _carried_heading(carried_m_s, speed_m_s, begin_rad) - _carried_heading(0.0, speed_m_s, begin_rad)
     assert abs(expected) > 0.02
     assert math.atan2(turn.imag, turn.real) == pytest.approx(math.remainder(expected, 2.0 * math.pi), abs=0.012)
     straight = np.column_stack([along_m, 0.0 * along_m]).astype(np.float32)
-    turn = turn_against(straight, speed_m_s * step_s, 0.03j * step_s, X_ICR_M)
+    turn = drift_correction(straight, speed_m_s * step_s, 0.03j * step_s, X_ICR_M)
     assert math.atan2(turn.imag, turn.real) == pytest.approx(-math.atan2(0.03, speed_m_s), abs=1e-3)
 
 
 def test_a_robot_is_not_turned_for_what_comes_behind_a_sharp_turn_or_the_end() -> None:
     """As the task's table has it: the robot stops there."""
     there = np.column_stack([np.linspace(0.0, 0.4, 5), np.zeros(5)]).astype(np.float32)
-    expected = turn_against(there, 0.02, 0.003j, X_ICR_M)
+    expected = drift_correction(there, 0.02, 0.003j, X_ICR_M)
     for behind in (there[::-1], np.repeat(there[-1:], 5, axis=0)):
-        assert turn_against(np.vstack([there, behind[1:]]), 0.02, 0.003j, X_ICR_M) == pytest.approx(expected)
-    assert turn_against(np.repeat(there[-1:], 5, axis=0), 0.02, 0.003j, X_ICR_M) == 1.0
+        assert drift_correction(np.vstack([there, behind[1:]]), 0.02, 0.003j, X_ICR_M) == pytest.approx(expected)
+    assert drift_correction(np.repeat(there[-1:], 5, axis=0), 0.02, 0.003j, X_ICR_M) == 1.0
 
 
 def test_a_robot_that_gets_nowhere_is_left_to_the_sampled_plan() -> None:
