@@ -220,7 +220,7 @@ def drive(
         Boundaries(Footprint(0.5, 0.4, 0.0), Fence()), StoppingSettings(0.1, 0.1, 20.0, period_s), 0.0
     )
     pipeline = Pipeline(fusion(mean, spread), planner, governor, 0.2, no_fence, disturbance)
-    adaptation = _learner(robot, pipeline) if contender.learns else NoAdaptation()
+    adaptation = _learner(robot, pipeline, contender.offset_free) if contender.learns else NoAdaptation()
     every_ms = round(1e3 * period_s)
     rows: list[tuple[float, ...]] = []
     wheels, poses = [], []
@@ -244,9 +244,9 @@ def drive(
     return Drive(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5:7], track.course.off_m(table[:, 1:3]))
 
 
-def _learner(robot: ForeignRobot, pipeline: Pipeline) -> FastAdaptation:
+def _learner(robot: ForeignRobot, pipeline: Pipeline, on_slope: bool) -> FastAdaptation:
     """The filter beside this pipeline."""
     believed = model(robot)
     mean = believed_geometry(believed)
     low, high = np.sort([0.5 * mean.mean, 1.5 * mean.mean], axis=0)
-    return FastAdaptation(mean, low, high, lambda geometry: apply_geometry(pipeline, believed, geometry))
+    return FastAdaptation(mean, low, high, lambda geometry: apply_geometry(pipeline, believed, geometry), on_slope)

@@ -144,6 +144,7 @@ def create_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
         _rehearsed(setup, pipeline),
         *possible_range(setup.config.prior),
         lambda geometry: apply_geometry(pipeline, setup.model, geometry),
+        setup.config.control.disturbance,
     )
 
 
