@@ -117,9 +117,7 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
     if requested == "off":
         return AdaptationChoice("off", why)
     if control.disturbance:
-        why += (
-            "; remove control.disturbance, without which the robot stays nearer to its line; it will be refused later"
-        )
+        why += "; remove control.disturbance, which will be refused later: slopes are found without it"
     if requested == "audited":
         why += '; write "fast": its second estimator was no better and is gone'
     try:
