@@ -167,6 +167,8 @@ def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(p
 def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on(path):
     recorder = ProcessRecorder(recording(path))
     drive(recorder, 1, 5)
+    # What a writer has written and not confirmed is in the next file, too.
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
     os.kill(recorder.keeper_pid, signal.SIGKILL)
     wait_until(lambda: recorder.poll() and recorder.keeper_pid is None)
     stats = recorder.poll()
@@ -187,6 +189,7 @@ def test_one_writer_after_the_other_may_die(path):
     following = 1
     for deaths in (1, 2, 3):
         following = kept_going(recorder, following, lambda stats: stats.waiting_ticks < 3)
+        wait_until(lambda: recorder.poll().waiting_ticks == 0)
         os.kill(recorder.writer_pid, signal.SIGKILL)
         following = kept_going(recorder, following, lambda stats, deaths=deaths: stats.writer_deaths == deaths)
         following = kept_going(recorder, following, lambda stats: not stats.fault)
