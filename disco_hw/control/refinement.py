@@ -192,7 +192,8 @@ def drift_correction(line_m: NDArray[np.float32], step_m: float, carried_m: comp
     """Return the rotation of the heading at the start of a line that compensates a drift, a unit complex number.
 
     `line_m` (N, 2): points of the line. While the robot covers `step_m` of it the ground carries it by `carried_m`
-    (x + i y). Its own motion is the difference, and its heading the stable one along that (`stable_yaw`).
+    (x + i y). Its own motion is the difference, and its heading the stable one along that (`stable_yaw`). A drift of
+    more than half the robot's speed, as where it slows down to stop, counts as half.
     """
     ways = np.diff(line_m.astype(np.float64) @ (1.0, 1j))
     lengths_m = np.abs(ways)
@@ -202,7 +203,7 @@ def drift_correction(line_m: NDArray[np.float32], step_m: float, carried_m: comp
     ways, lengths_m = ways[: ends[0] + 1] if ends.size else ways, lengths_m[: ends[0] + 1] if ends.size else lengths_m
     if min(lengths_m[0], step_m) < SMALLEST_WAY_M:
         return 1.0
-    own = ways - carried_m * lengths_m / step_m
+    own = ways - carried_m * lengths_m / max(step_m, 2.0 * abs(carried_m))
     with_ground, without = (
         stable_yaw(np.unwrap(np.angle(one)), np.abs(one), x_icr_m, closed=False)[0] for one in (own, ways)
     )

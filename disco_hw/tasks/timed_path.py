@@ -234,6 +234,8 @@ class TimedPathTerms(NamedTuple):
         after = np.minimum(np.searchsorted(moves, np.arange(self.x.size)), moves.size - 1)
         length_m = np.hypot(x, y)
         if carried_m:
-            own = length_m[moves] * np.exp(1j * along.astype(np.float64)) - carried_m
+            # No more than half of its way, as where the place comes to rest.
+            part = np.minimum(0.5 * length_m[moves] / abs(carried_m), 1.0)
+            own = length_m[moves] * np.exp(1j * along.astype(np.float64)) - part * carried_m
             along, length_m[moves] = np.angle(own), np.abs(own)
         return stable_yaw(np.unwrap(along.astype(np.float64))[after], length_m, x_icr_m, False)

@@ -168,6 +168,14 @@ def test_the_last_heading_is_turned_against_the_ground_that_carries_the_robot(be
     assert math.atan2(turn.imag, turn.real) == pytest.approx(-math.atan2(0.03, speed_m_s), abs=1e-3)
 
 
+@pytest.mark.parametrize("carried_m", [0.02j, 0.5j])
+def test_a_robot_that_slows_down_to_stop_is_turned_by_thirty_degrees_at_most(carried_m: complex) -> None:
+    """Though the ground may then carry it faster than it goes."""
+    there = np.column_stack([np.linspace(0.0, 4.0 * X_ICR_M, 13), np.zeros(13)]).astype(np.float32)
+    turn = drift_correction(there, 0.01, carried_m, X_ICR_M)
+    assert math.atan2(turn.imag, turn.real) == pytest.approx(-math.atan(0.5), abs=1e-3)
+
+
 def test_a_robot_is_not_turned_for_what_comes_behind_a_sharp_turn_or_the_end() -> None:
     """As the task's table has it: the robot stops there."""
     there = np.column_stack([np.linspace(0.0, 0.4, 5), np.zeros(5)]).astype(np.float32)
