@@ -18,7 +18,7 @@ from disco_hw.model.step import FreeRun
 class DisturbanceCompensation:
     """Follows the disturbance from plan to plan.
 
-    Of one that is not estimated in full only the `slide` counts, and nothing where neither is.
+    With `offset_free` all of it counts. Without, only its `slide` does where plans are refined, and else nothing.
     """
 
     def __init__(self, points: RolloutPoints, settings: DiscoSettings) -> None:

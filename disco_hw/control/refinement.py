@@ -200,7 +200,8 @@ def drift_correction(line_m: NDArray[np.float32], step_m: float, carried_m: comp
     turns_rad = np.abs(np.angle(ways[1:] * ways[:-1].conj()))
     # As in the task's table, what comes behind the line's end or a sharp turn says nothing of the heading before.
     ends = np.flatnonzero((lengths_m[1:] < SMALLEST_WAY_M) | (turns_rad > SHARP_RAD))
-    ways, lengths_m = ways[: ends[0] + 1] if ends.size else ways, lengths_m[: ends[0] + 1] if ends.size else lengths_m
+    count = ends[0] + 1 if ends.size else ways.size
+    ways, lengths_m = ways[:count], lengths_m[:count]
     if min(lengths_m[0], step_m) < SMALLEST_WAY_M:
         return 1.0
     own = ways - carried_m * lengths_m / max(step_m, 2.0 * abs(carried_m))
