@@ -48,7 +48,6 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
     nmpc_forward = Contender(partial(_nmpc, speed_m_s, True), learns=True)
     adapting = disco(settings, learns=True)
     sampled = disco(DiscoSettings.for_speed(speed_m_s, RATE_HZ, refine=False), learns=True)
-    offset_free = disco(replace(settings, offset_free=True), learns=True)
     return {
         "pure_pursuit": classical(PurePursuit(), speed_m_s),
         "pure_pursuit_integral": integral,
@@ -58,10 +57,8 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
         "nmpc_forward": nmpc_forward,
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
-        "disco_ut_offset_free": disco(replace(settings, offset_free=True)),
         "disco_adapting": adapting,
         "disco_sampled": sampled,
-        "disco_offset_free": offset_free,
         "disco_truth": disco(settings, knows=True),
         "kanayama_truth": classical(Kanayama(), speed_m_s, knows=True),
     }

@@ -21,7 +21,6 @@ from disco_hw.control.baselines import Follower, Law, Reference
 from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.plan import ROTATION
 from disco_hw.estimation import PoseFusion
-from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
@@ -138,7 +137,6 @@ class Contender:
     planner: Callable[[ForeignRobot, Track], Planner]
     knows: bool = False
     learns: bool = False
-    offset_free: bool = False
 
 
 def classical(law: Law, speed_m_s: float = 0.2, knows: bool = False) -> Contender:
@@ -159,7 +157,7 @@ def disco(settings: DiscoSettings, knows: bool = False, learns: bool = False, se
         task = track.task if settings.refine or track.sampled is None else track.sampled
         return Disco(model(robot, knows), task, settings, LIMITS, seed)
 
-    return Contender(made, knows, learns, settings.offset_free)
+    return Contender(made, knows, learns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,12 +213,11 @@ def drive(
     period_s = 1.0 / rate_hz
     governor = Governor(WheelLimits(LIMITS.speed_rad_s, *[LIMITS.acceleration_rad_s2] * 2), period_s)
     planner = contender.planner(robot, track)
-    disturbance = DisturbanceEstimator() if contender.offset_free else None
     no_fence = FenceGuard(
         Boundaries(Footprint(0.5, 0.4, 0.0), Fence()), StoppingSettings(0.1, 0.1, 20.0, period_s), 0.0
     )
-    pipeline = Pipeline(fusion(mean, spread), planner, governor, 0.2, no_fence, disturbance)
-    adaptation = _learner(robot, pipeline, contender.offset_free) if contender.learns else NoAdaptation()
+    pipeline = Pipeline(fusion(mean, spread), planner, governor, 0.2, no_fence)
+    adaptation = _learner(robot, pipeline) if contender.learns else NoAdaptation()
     every_ms = round(1e3 * period_s)
     rows: list[tuple[float, ...]] = []
     wheels, poses = [], []
@@ -244,9 +241,9 @@ def drive(
     return Drive(table[:, 0], table[:, 1:4], table[:, 4], table[:, 5:7], track.course.off_m(table[:, 1:3]))
 
 
-def _learner(robot: ForeignRobot, pipeline: Pipeline, on_slope: bool) -> FastAdaptation:
+def _learner(robot: ForeignRobot, pipeline: Pipeline) -> FastAdaptation:
     """The filter beside this pipeline."""
     believed = model(robot)
     mean = believed_geometry(believed)
     low, high = np.sort([0.5 * mean.mean, 1.5 * mean.mean], axis=0)
-    return FastAdaptation(mean, low, high, lambda geometry: apply_geometry(pipeline, believed, geometry), on_slope)
+    return FastAdaptation(mean, low, high, lambda geometry: apply_geometry(pipeline, believed, geometry))

@@ -33,18 +33,17 @@ class FastAdaptation:
     """Learns from `model`, within `low` and `high` (order of NAMES).
 
     `apply_geometry` makes planner and estimator use a geometry, None for the model file's; it raises ValueError for one
-    that they cannot take. `on_slope`: whether the ground is taken for a slope at first.
+    that they cannot take.
     """
 
     def __init__(
-        self, model: Geometry, low: np.ndarray, high: np.ndarray, apply_geometry: Callable[[Geometry | None], None],
-        on_slope: bool = False,
-    ) -> None:  # fmt: skip
+        self, model: Geometry, low: np.ndarray, high: np.ndarray, apply_geometry: Callable[[Geometry | None], None]
+    ) -> None:
         self._model, self._in_force, self._apply_geometry = model, model, apply_geometry
         self._low, self._high = low, high
         order = np.ix_(_FROM_NAMES, _FROM_NAMES)
         self._filter = GeometryFilter(
-            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES], on_slope
+            model.mean[_FROM_NAMES], model.covariance[order], low[_FROM_NAMES], high[_FROM_NAMES]
         )
         self._next_ns: int | None = None
         self._poses = self._changes = self._carried = 0

@@ -212,12 +212,11 @@ class _Bank:
 class GeometryFilter:
     """Learns (wheel radius, axial distance, x_icr) from `mean` (3,) and `covariance` (3, 3), within `low` and `high`.
 
-    Learns too whether the ground carries the robot, as a slope does, and by how much; with `on_slope` it assumes that
-    at first. Pure: no clock, the same samples give the same numbers bit for bit.
+    Learns too whether the ground carries the robot, as a slope does, and by how much. Pure: no clock, the same samples
+    give the same numbers bit for bit.
     """
 
-    def __init__(self, mean: Array, covariance: Array, low: Array, high: Array, on_slope: bool = False) -> None:
-        self._starts_on_slope = on_slope
+    def __init__(self, mean: Array, covariance: Array, low: Array, high: Array) -> None:
         self._first, self._first_covariance = mean.copy(), covariance.copy()
         self._low, self._high = low, high
         self._wheels: deque[WheelSample] = deque()
@@ -414,8 +413,6 @@ class GeometryFilter:
     def _place(self, pose: PoseSample) -> None:
         """Take the pose as it was measured."""
         self._bank.place(pose)
-        if self._starts_on_slope:
-            self._bank.toggle_ground(_BELIEVED)
         self._only(_BELIEVED)
         self._placed, self._rolled_rad, self._astray = True, 0.0, 0
         self._due[:] = 0.0

@@ -111,13 +111,13 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
     Raises InputError for one that is asked for and that the model does not allow.
     """
     requested = control.adaptation
-    why = f'{REQUESTED_BY_FILE} = "{requested}"'
+    why, to_remove = f'{REQUESTED_BY_FILE} = "{requested}"', ""
     if pose.rate_hz is not None:
-        why += "; remove pose.rate_hz, which decides nothing any more and will be refused later"
-    if requested == "off":
-        return AdaptationChoice("off", why)
+        to_remove += "; remove pose.rate_hz, which decides nothing any more and will be refused later"
     if control.disturbance:
-        why += "; remove control.disturbance, which will be refused later: slopes are found without it"
+        to_remove += "; remove control.disturbance, which does nothing any more and will be refused later"
+    if requested == "off":
+        return AdaptationChoice("off", why + to_remove)
     if requested == "audited":
         why += '; write "fast": its second estimator was no better and is gone'
     try:
@@ -125,8 +125,8 @@ def choose_adaptation(control: Control, pose: PoseInput, model: Model) -> Adapta
     except InputError as error:
         if requested != "auto":
             raise
-        return AdaptationChoice("off", str(error))
-    return AdaptationChoice("fast", why)
+        return AdaptationChoice("off", str(error) + to_remove)
+    return AdaptationChoice("fast", why + to_remove)
 
 
 def believed_geometry(model: Model) -> Geometry:

@@ -2,7 +2,7 @@
 
 `Disco.plan` reads as the paper's Algorithm 1; each of its parts is a file of its own:
 
-    state ── DisturbanceCompensation ── StatePrediction ──▶ PlanStart
+    state ── StatePrediction ──▶ PlanStart
     belief ── RolloutPoints ─┬──▶ SkidSteer (the compiled rollout)
     task, Surroundings ──────┘        │
     Guidance ──▶ Sampling (on an Optimiser) ──▶ Refinement ──▶ WheelPlan
@@ -15,7 +15,6 @@ import math
 
 import numpy as np
 
-from disco_hw.control.disturbance_compensation import DisturbanceCompensation
 from disco_hw.control.kernel import BLOCK, CHANNELS, START_LEFT, START_RIGHT, START_SIZE, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.avoid import Area
 from disco_hw.control.kernel.guide import SteeredChassis
@@ -62,17 +61,14 @@ class Disco:
         self.task, self.settings, self._surroundings = task, settings, surroundings
         self._points = points = RolloutPoints(model, settings, limits, seed)
         self._limits = limits
-        self._compensation = DisturbanceCompensation(points, settings)
-        self._prediction = StatePrediction(points, self._compensation, settings, limits)
+        self._prediction = StatePrediction(points, settings, limits)
         sampler, change = settings.sampler, limits.acceleration_rad_s2 * settings.step_s
         self.optimiser = Optimiser(
             sampler, CHANNELS, points.weights.size, points.history, limits.speed_rad_s, change, seed
         )
         self._guidance = Guidance(self.optimiser, settings)
         self._sampling = Sampling(self.optimiser, points.weights, settings, surroundings)
-        # With an estimated disturbance, which changes in every tick, refined commands would be restless.
-        is_refined = settings.refine and not settings.offset_free
-        self.refinement = Refinement(limits, settings, points.history) if is_refined else None
+        self.refinement = Refinement(limits, settings, points.history) if settings.refine else None
         self._set_refined_model()
         self._stopping = Stopping(settings, limits)
         # Buffers of the compiled rollout: where it begins, and how the wheels turn in it.
@@ -132,7 +128,6 @@ class Disco:
         self.optimiser.reset()
         self._guidance.reset()
         self._stopping.end()
-        self._compensation.pause()
         if self.refinement is not None:
             self.refinement.reset()
 
@@ -160,9 +155,8 @@ class Disco:
         shift_steps = 0.0 if last_ns is None else max((now_ns - last_ns) * 1e-9 / settings.step_s, 0.0)
 
         # Where it begins, and what is rolled out from there.
-        self._compensation.follow(now_ns, state)
         begin = self._prediction.start(state, now_ns, elapsed_s)
-        system = self._system(state, begin, task_s)
+        system = self._system(begin, task_s)
         self._last_ns = now_ns
 
         # Sample around the last plan, roll out, weigh, update; stop where nothing helps.
@@ -188,9 +182,9 @@ class Disco:
             trajectory = begin.mean_path(self._points.mean_run, nominal)
         elif refined is not None:
             return WheelPlan(now_ns, settings.step_s, *refined, diagnostics)
-        return WheelPlan(now_ns, settings.step_s, self._compensation.commanded(nominal), trajectory, diagnostics)
+        return WheelPlan(now_ns, settings.step_s, nominal, trajectory, diagnostics)
 
-    def _system(self, state: PlannerState, begin: PlanStart, task_s: float) -> SkidSteer:
+    def _system(self, begin: PlanStart, task_s: float) -> SkidSteer:
         """Return what the compiled step rolls out: f_theta from the plan's start, and the task's cost."""
         points, settings = self._points, self.settings
         x, y, yaw, left, right = begin.state.tolist()
@@ -198,15 +192,15 @@ class Disco:
             task_s, x, y, yaw, self._memory, settings.step_s, settings.sampler.horizon, points.chassis.x_icr_m
         )
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)
-        slides = self._compensation.slides_in(settings.step_s)
-        self._start[:] = x - origin_x, y - origin_y, *direction, left, right, begin.elapsed_s, place, *slides
+        carried_m = begin.drift * settings.step_s
+        self._start[:] = x - origin_x, y - origin_y, *direction, left, right, begin.elapsed_s, place, *carried_m
         if points.history:
             self.optimiser.set_command_history(begin.earlier)
         if points.is_sampled:
             points.draw(self.optimiser.step_number, self.optimiser.padded_samples)
         means = None if begin.point_means is None else begin.point_means.astype(np.float32)
         return SkidSteer(
-            self._start, True if settings.offset_free else None, means, points.base, points.effects, points.each,
+            self._start, means, points.base, points.effects, points.each,
             points.ahead, points.scaled, points.skip_mean, points.series, points.wide, points.euler, task,
             points.history, self._wheels, points.wheels_differ, self._area(x, y, (origin_x, origin_y)),
         )  # fmt: skip
@@ -243,7 +237,7 @@ class Disco:
         return 1.0 if self.refinement is None or outcome not in REFINED else self.refinement.speed_part
 
     def _refined(self, begin: PlanStart, system: SkidSteer, nominal: Array) -> tuple[Array, Array] | None:
-        """Return the refined commands (N, 2), as the robot is to get them, and where they lead; None without such."""
+        """Return the refined commands (N, 2) and where they lead; None without such."""
         if self.refinement is None:
             return None
         commands = self.refinement.improve(system.task, system.start, begin, nominal)
@@ -252,8 +246,7 @@ class Disco:
         # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
         if not self._is_clear(begin, commands, system):
             return None
-        path = begin.mean_path(self._points.mean_run, commands)
-        return self._compensation.commanded(commands), path
+        return commands, begin.mean_path(self._points.mean_run, commands)
 
     def _is_clear(self, begin: PlanStart, commands: Array, system: SkidSteer) -> bool:
         """Whether a robot that does this and then stops keeps clear of the fence and obstacles under every point."""
@@ -276,7 +269,7 @@ class Disco:
         trajectories = np.empty((len(commands), self.settings.sampler.horizon + 1, 3))
         for row, one in enumerate(commands):
             trajectories[row] = self._begin.mean_path(self._points.mean_run, one)
-        return Rollouts(np.array([self._compensation.commanded(one) for one in commands]), trajectories, weights)
+        return Rollouts(commands, trajectories, weights)
 
     def point_trajectories(self) -> Array:
         """Return the last plan under each shared parameter point (or draw): (L, T + 1, 3) x, y, yaw.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,6 @@ from disco_hw.model import Model
 from disco_hw.model.terms import Remembered, memories_of, of_wheels
 
 Array = NDArray[np.float64]
-Acting = Callable[[Array], Array]
 DELAYED_BY = DELAY.columns[0]
 
 
@@ -60,10 +58,8 @@ class DriveMeans:
 class PastMotion:
     """The means that a model keeps, n of them, at a time of the recent past, under each of its parameter points.
 
-    Commands act later under a longer delay. `acting(commands)` (N, 2) in all methods: what of commands moves the model,
-    and `turning` (2,) how the model's wheels turn (rad/s) where the measured ones turn as they do. What was before a
-    state's first command, and before its wheel speeds, is known by its means alone: it is taken to have moved the model
-    as these do.
+    Commands act later under a longer delay. What was before a state's first command, and before its wheel speeds, is
+    known by its means alone.
     """
 
     def __init__(self, model: Model, delays_s: Array, mean_delay_s: float) -> None:
@@ -80,36 +76,30 @@ class PastMotion:
         column = model.parameter_names.index(DELAYED_BY)
         return cls(model, theta[:, column], float(mean_theta[0, column]))
 
-    def of_mean(self, state: PlannerState, t_ns: int, acting: Acting, turning: tuple[float, float]) -> Array:
+    def of_mean(self, state: PlannerState, t_ns: int) -> Array:
         """Means (n,) at `t_ns` in the mean of what is believed, in the order of the compiled step."""
-        of_commands, of_body = self._of_commands(state, t_ns, self._mean_delay_s, acting), np.zeros(len(self._body))
-        if state.body_means:
-            measured = state.left_speed_rad_s, state.right_speed_rad_s
-            for n, memory in enumerate(self._body):
-                of_body[n] = state.body_means[n] + of_wheels(memory, *turning) - of_wheels(memory, *measured)
-        return np.concatenate([of_commands, of_body])
+        of_body = state.body_means or np.zeros(len(self._body))
+        return np.concatenate([self._of_commands(state, t_ns, self._mean_delay_s), of_body])
 
-    def of_points(self, state: PlannerState, t_ns: int, acting: Acting, of_mean: Array) -> Array:
+    def of_points(self, state: PlannerState, t_ns: int, of_mean: Array) -> Array:
         """Means (L, n) at `t_ns` under the points, from those of the mean (n,) at that time."""
         means = np.tile(of_mean, (len(self._delays_s), 1))
         for delay_s in np.unique(self._delays_s):
-            of_commands = self._of_commands(state, t_ns, float(delay_s), acting)
+            of_commands = self._of_commands(state, t_ns, float(delay_s))
             means[self._delays_s == delay_s, : of_commands.size] = of_commands
         return means
 
-    def _of_commands(self, state: PlannerState, t_ns: int, delay_s: float, acting: Acting) -> Array:
+    def _of_commands(self, state: PlannerState, t_ns: int, delay_s: float) -> Array:
         if not self._commands or not state.sent:
             return np.zeros(2 * len(self._commands))
         commanded = np.array([(one.left_rad_s, one.right_rad_s) for one in state.sent])
-        moved = acting(commanded)
         begins_s = np.array([(one.t_ns - t_ns) * 1e-9 + delay_s for one in state.sent])
         begins_s = np.minimum(begins_s, 0.0)
         ends_s = np.append(begins_s[1:], 0.0)
         found = np.empty((len(self._commands), 2))
         before = state.command_means or np.zeros_like(found)
         for n, memory in enumerate(self._commands):
-            first = memory.of(moved[0], moved[0, ::-1]) - memory.of(commanded[0], commanded[0, ::-1])
             share = np.exp(ends_s / memory.time_s) - np.exp(begins_s / memory.time_s)
             left = np.exp(begins_s[0] / memory.time_s)
-            found[n] = left * (np.array(before[n]) + first) + share @ memory.of(moved, moved[:, ::-1])
+            found[n] = left * np.array(before[n]) + share @ memory.of(commanded, commanded[:, ::-1])
         return found.ravel()

@@ -17,17 +17,18 @@ from numpy.typing import NDArray
 
 from disco_hw import config
 from disco_hw.model import Belief, Model
-from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
+from disco_hw.model.drift import NO_DRIFT, Drift
 
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION, SAME_SINCE_VERSION = 5, 4
+PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 6, 4, 5
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
 1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
 weights, and shorter steps below 0.2 m/s. 4: along a line of way-points tabulated twice as finely. 5: against the ground
-that carries the robot, where the log's beliefs say so: logs since `SAME_SINCE_VERSION` are replayed alike.
+that carries the robot, where the log's beliefs say so. 6: `control.disturbance` is not followed any more. Logs since
+`SAME_SINCE_VERSION` are replayed alike, but for those that followed it, up to `DISTURBANCE_UNTIL_VERSION`.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter
@@ -120,11 +121,9 @@ class DiscoSettings:
     a line; kernel/guide.py); for a horizon also where the plan stands, whatever they cost; 0 without a guide.
     euler: whether a step of a rollout goes straight along the heading that it begins with (explicit Euler), not along
     the exact arc.
-    offset_free: whether rollouts move beside the model as the robot was found to (model/coefficients.py), and lose of a
-    command what its wheels were found to lose (wheel_loss.py).
     iterations_at_start: optimisation steps for the first plan after a reset.
     refine: whether a Gauss-Newton refinement in the mean of the belief improves the plan beside the task's line
-    (refinement.py); not together with `offset_free`.
+    (refinement.py).
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
     decay_s: how long the planner answers with a ramp to zero when nothing helps, before it raises NoValidControl.
@@ -139,7 +138,6 @@ class DiscoSettings:
     gain_by_time: bool = True
     guide_below: float = 0.85
     euler: bool = False
-    offset_free: bool = False
     refine: bool = True
     iterations_at_start: int = 5
     min_ess: float = 3.0
@@ -217,9 +215,7 @@ class DiscoSettings:
             step_s, horizon = control.step_s, horizon if control.mode == "paper" else Sampler().horizon
         horizon = horizon if control.horizon is None else control.horizon
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)
-        return replace(
-            settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty, offset_free=control.disturbance
-        )
+        return replace(settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty)
 
 
 class NoValidControl(Exception):  # noqa: N818
@@ -237,7 +233,7 @@ class SentCommand(msgspec.Struct, frozen=True, gc=False):
 class PlannerState(msgspec.Struct, frozen=True, gc=False):
     """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first.
 
-    `disturbance`: how the robot moves beside its model. `command_means`, `body_means`: what the model's terms remember,
+    `drift`: of the ground. `command_means`, `body_means`: what the model's terms remember,
     of commands (a pair each) up to the first one of `sent`, of the wheels (a number each) up to `t_ns`; empty if
     nothing was before.
     `elapsed_s`: time since the drive began, for effects that depend on it; None counts from the planner's start.
@@ -251,7 +247,7 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
     right_speed_rad_s: float
     sent: tuple[SentCommand, ...] = ()
     elapsed_s: float | None = None
-    disturbance: Disturbance = NO_DISTURBANCE
+    drift: Drift = NO_DRIFT
     command_means: tuple[tuple[float, float], ...] = ()
     body_means: tuple[float, ...] = ()
 

@@ -107,7 +107,7 @@ class Refinement:
     def improve(self, terms: Terms, start: NDArray[np.float32], begin: PlanStart, nominal: Array) -> Array | None:
         """Return commands (N, 2) that cost no more than the plan `nominal` (T, 2); None off the line.
 
-        `terms` of the task and `start` (11,) are those of `SkidSteer`.
+        `terms` of the task and `start` (10,) are those of `SkidSteer`.
         What is returned is kept as the start of the next refinement.
         """
         is_timed = hasattr(terms, "headings")
@@ -175,7 +175,7 @@ class Refinement:
         change_m = ACCELERATION_M / self._step_s
         change = min(self._limits.acceleration_rad_s2 * self._step_s, 4.0 * self._limits.speed_rad_s)
         return Problem(
-            self._start, float(begin.elapsed_s), np.array(begin.slide, np.float64), begin.mean_means, self._base,
+            self._start, float(begin.elapsed_s), np.array(begin.drift, np.float64), begin.mean_means, self._base,
             self._effects, self._series, self._history, self._reference,
             float(self._limits.speed_rad_s), float(change), self._before, change_m,
             self._found[3:5], end_weight, behind_m,

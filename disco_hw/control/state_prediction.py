@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from disco_hw.control.disturbance_compensation import DisturbanceCompensation
 from disco_hw.control.plan import Array, CommandLimits, DiscoSettings, PlannerState, command_history
 from disco_hw.control.rollout_points import RolloutPoints
-from disco_hw.model.coefficients import NO_SLIDE
+from disco_hw.model.drift import NO_DRIFT_M_S
 from disco_hw.model.step import FreeRun
 
 SHORTEST_GAP_S = 1e-6
@@ -18,11 +17,11 @@ SHORTEST_GAP_S = 1e-6
 
 
 class PlanStart(NamedTuple):
-    """Start of a plan, for the undisturbed robot that turns as the real one does.
+    """Where a plan starts, and what was before.
 
     `state` (5,): x, y (m), yaw (rad), wheel speeds (rad/s) at `t0_ns`, `elapsed_s` after the drive began. `before`: the
     commands that the plan's first change is limited from. `earlier` (history, 2): commands before the plan, in its
-    steps. `slide` (3,): `Disturbance.slides`. `mean_means` (n,), `point_means` (L, n): what the model's terms remember,
+    steps. `drift` (2,): of the ground (m/s). `mean_means` (n,), `point_means` (L, n): what the model's terms remember,
     in the mean of what is believed and under each point; None where they remember nothing.
     """
 
@@ -31,14 +30,14 @@ class PlanStart(NamedTuple):
     state: Array
     before: tuple[float, float]
     earlier: Array
-    slide: Array
+    drift: Array
     mean_means: Array | None
     point_means: Array | None
 
     @classmethod
     def at_rest(cls, history: int) -> PlanStart:
         """Return the start of a robot that stands at the origin, with so many commands before."""
-        return cls(0, 0.0, np.zeros(5), (0.0, 0.0), np.zeros((history, 2)), NO_SLIDE, None, None)
+        return cls(0, 0.0, np.zeros(5), (0.0, 0.0), np.zeros((history, 2)), NO_DRIFT_M_S, None, None)
 
     def mean_path(self, run: FreeRun, commands: Array) -> Array:
         """Poses (T + 1, 3) that commands (T, 2) lead through in the mean of what is believed."""
@@ -53,36 +52,31 @@ class PlanStart(NamedTuple):
         history_and_plan = np.concatenate([self.earlier, commands]) if history else commands
         # A run overwrites the means.
         slip_means = None if means is None else means.copy()
-        return run.states(self.state, history_and_plan, history, self.elapsed_s, point, self.slide, slip_means)[:, :3]
+        return run.states(self.state, history_and_plan, history, self.elapsed_s, point, self.drift, slip_means)[:, :3]
 
 
 class StatePrediction:
     """Predicts the state to a plan's start, under the mean parameters and the commands already sent."""
 
-    def __init__(
-        self, points: RolloutPoints, compensation: DisturbanceCompensation, settings: DiscoSettings,
-        limits: CommandLimits,
-    ) -> None:  # fmt: skip
-        self._points, self._compensation = points, compensation
-        self._settings, self._limits = settings, limits
+    def __init__(self, points: RolloutPoints, settings: DiscoSettings, limits: CommandLimits) -> None:
+        self._points, self._settings, self._limits = points, settings, limits
 
     def start(self, state: PlannerState, t0_ns: int, elapsed_s: float) -> PlanStart:
         """Return where a plan that acts from `t0_ns` on begins, `elapsed_s` after the drive began."""
-        points, compensation = self._points, self._compensation
+        points = self._points
         before = self.anchor(state)
-        turning = compensation.turning(state.left_speed_rad_s, state.right_speed_rad_s)
+        # Sampled plans know of no drift, and are judged without it.
+        drift = state.drift.vector if self._settings.refine else NO_DRIFT_M_S
         mean_means = point_means = None
         if points.past is not None:
-            mean_means = points.past.of_mean(state, state.t_ns, compensation.acting, turning)
-        predicted = self._predicted(state, turning, t0_ns, elapsed_s, mean_means)
+            mean_means = points.past.of_mean(state, state.t_ns)
+        predicted = self._predicted(state, t0_ns, elapsed_s, drift, mean_means)
         if points.past is not None and mean_means is not None:
-            point_means = points.past.of_points(state, t0_ns, compensation.acting, mean_means)
+            point_means = points.past.of_points(state, t0_ns, mean_means)
         earlier = np.zeros((0, 2))
         if points.history:
             earlier = self.commands_before(state, t0_ns, self._settings.step_s, points.history)
-        return PlanStart(
-            t0_ns, elapsed_s, predicted, before, earlier, compensation.slide, mean_means, point_means
-        )  # fmt: skip
+        return PlanStart(t0_ns, elapsed_s, predicted, before, earlier, drift, mean_means, point_means)
 
     def anchor(self, state: PlannerState) -> tuple[float, float]:
         """Commands that the plan's first change is limited from.
@@ -90,31 +84,28 @@ class StatePrediction:
         The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, so that
         a plan does not run away from wheels that are held back.
         """
-        left, right = self._compensation.turning(state.left_speed_rad_s, state.right_speed_rad_s)
+        left, right = state.left_speed_rad_s, state.right_speed_rad_s
         if not state.sent:
             return left, right
         last = state.sent[-1]
         last_left, last_right = last.left_rad_s, last.right_rad_s
-        if not self._compensation.is_none:
-            last_left, last_right = self._compensation.acting(np.array([[last_left, last_right]]))[0].tolist()
         slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._points.chassis.response_s)
         return min(max(last_left, left - slack), left + slack), min(max(last_right, right - slack), right + slack)
 
     def commands_before(self, state: PlannerState, end_ns: int, step_s: float, count: int) -> Array:
         """Mean commands (count, 2) that act in each of the steps up to `end_ns`."""
         wheels = state.left_speed_rad_s, state.right_speed_rad_s
-        return self._compensation.acting(command_history(state.sent, end_ns, step_s, count, wheels))
+        return command_history(state.sent, end_ns, step_s, count, wheels)
 
     def _predicted(
-        self, state: PlannerState, turning: tuple[float, float], t0_ns: int, elapsed_s: float, means: Array | None
-    ) -> Array:
+        self, state: PlannerState, t0_ns: int, elapsed_s: float, drift: Array, means: Array | None
+    ) -> Array:  # fmt: skip
         """State (5,) at `t0_ns`; sets `means` to what is remembered then."""
-        start = np.array([state.x_m, state.y_m, state.yaw_rad, *turning])
+        start = np.array([state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s])
         gap_s = (t0_ns - state.t_ns) * 1e-9
         if gap_s < SHORTEST_GAP_S:
             return start
         count = math.ceil(gap_s / self._settings.step_s)
         run = FreeRun(self._points.model, self._points.mean_theta, gap_s / count)
         past = self.commands_before(state, t0_ns, gap_s / count, run.past_rows + count)
-        slide = self._compensation.slide
-        return np.asarray(run.states(start, past, run.past_rows, elapsed_s - gap_s, 0, slide, means)[-1])
+        return np.asarray(run.states(start, past, run.past_rows, elapsed_s - gap_s, 0, drift, means)[-1])

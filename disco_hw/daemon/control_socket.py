@@ -19,7 +19,6 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from msgspec.structs import asdict as asdict_of
 
 from disco_hw.daemon import HINT, peer_uid
 from disco_hw.daemon.loop import LoopStats
@@ -307,7 +306,6 @@ def status(core: DaemonCore, loop: dict[str, Any], recorder: RecorderStats) -> d
             "labels": {name: field.label for name, field in task.editable(core.config.robot).items()},
             "note": task.editing_note(core.config.robot),
         },
-        "disturbance": None if tick.pipeline.disturbance is None else asdict_of(tick.pipeline.disturbance),
         "plan": None if plan is None else {"ess": plan.diagnostics.ess, "temperature": plan.diagnostics.temperature},
         "loop": loop,
         "transport": asdict(core.transport.stats),

@@ -26,7 +26,7 @@ from disco_hw.estimation.odometry import (
     WheelTracker,
 )
 from disco_hw.estimation.pose_sources import PoseSources
-from disco_hw.model.coefficients import Disturbance
+from disco_hw.model.drift import Drift
 from drivers.types import PoseSample, WheelSample
 
 # Chosen: two poses in a row that are missing count as a gap; a single late one does not.
@@ -141,9 +141,9 @@ class PoseFusion:
 
     def set_parameters(self, parameters: OdometryParameters) -> None:
         """Follow the wheels with another geometry from now on; the present estimate and its uncertainty stay."""
-        disturbance = self._filter.disturbance
+        drift = self._filter.drift
         self._filter = PoseFilter(self._settings, parameters)
-        self._filter.disturbance = disturbance
+        self._filter.drift = drift
         if self._buffer is not None:
             self._buffer.set_filter(self._filter)
 
@@ -151,14 +151,6 @@ class PoseFusion:
     def parameters(self) -> OdometryParameters:
         """The geometry in force."""
         return self._filter.parameters
-
-    @property
-    def wheels_rad_s(self) -> tuple[float, float]:
-        """Newest wheel speeds, left and right; zero before the first."""
-        if self._buffer is None:
-            return 0.0, 0.0
-        wheels = self._buffer.newest_wheels
-        return wheels.left_speed_rad_s, wheels.right_speed_rad_s
 
     @property
     def wheel_difference_rad(self) -> float:
@@ -171,9 +163,9 @@ class PoseFusion:
         """Take the heading for unknown from the next position without one on: what it rests on was no measurement."""
         self._forgets_heading = True
 
-    def set_disturbance(self, disturbance: Disturbance) -> None:
-        """Take the robot to move so beside its geometry from now on."""
-        self._filter.disturbance = disturbance
+    def set_drift(self, drift: Drift) -> None:
+        """Take the ground to carry the moving robot so from now on."""
+        self._filter.drift = drift
 
     def add_wheels(self, sample: WheelSample) -> None:
         """Take in a wheel sample; it must be newer than all before, otherwise it is dropped and counted."""

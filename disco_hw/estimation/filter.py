@@ -26,7 +26,7 @@ from disco_hw.estimation.odometry import (
     rebased,
     wrap,
 )
-from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
+from disco_hw.model.drift import NO_DRIFT, Drift
 
 # Without newer samples the wheels are taken to keep their speeds for so long, then to stand.
 MAX_EXTRAPOLATION_S = 0.2
@@ -166,7 +166,7 @@ class PoseFilter:
 
     def __init__(self, settings: Estimation, parameters: OdometryParameters) -> None:
         self.parameters = parameters
-        self.disturbance: Disturbance = NO_DISTURBANCE
+        self.drift: Drift = NO_DRIFT
         self._model = motion_model(settings, parameters)
         self._pose_limit = gate_limit(settings.gate_probability)
         self._position_limit = gate_limit(settings.gate_probability, with_heading=False)
@@ -313,21 +313,20 @@ class PoseFilter:
         belief, candidate = state.belief, state.candidate
         left_turn, right_turn = left_rad - state.left_rad, right_rad - state.right_rad
         if left_turn or right_turn or position_variance or yaw_variance:
-            disturbance, since_s = self.disturbance, (t_ns - state.t_ns) * 1e-9
-            left_turn, right_turn = disturbance.turning(left_turn, right_turn, self.parameters.axial_distance_m)
+            drift, since_s = self.drift, (t_ns - state.t_ns) * 1e-9
             motion = arc(self.parameters, left_turn, right_turn)
             carried_s = 0.0
             if since_s > 0.0:
-                carried_s = disturbance.moving(left_turn / since_s, right_turn / since_s) * since_s
+                carried_s = drift.part_at(left_turn / since_s, right_turn / since_s) * since_s
 
             def follow(before: PoseBelief) -> PoseBelief:
-                if disturbance is NO_DISTURBANCE:
+                if drift is NO_DRIFT:
                     return predict(before, self._model, motion, position_variance, yaw_variance)
-                forward, left = disturbance.slide(motion.distance_m, carried_s, before.yaw_rad + 0.5 * motion.turn_rad)
-                slid = msgspec.structs.replace(
+                forward, left = drift.in_body(carried_s, before.yaw_rad + 0.5 * motion.turn_rad)
+                carried = msgspec.structs.replace(
                     motion, forward_m=motion.forward_m + forward, left_m=motion.left_m + left
                 )
-                return predict(before, self._model, slid, position_variance, yaw_variance)
+                return predict(before, self._model, carried, position_variance, yaw_variance)
 
             belief = belief.each(follow) if isinstance(belief, HeadingSearch) else belief and follow(belief)
             candidate = (

@@ -257,17 +257,6 @@ class Controller(msgspec.Struct, frozen=True, gc=False):
     declared: dict[str, float] = {}
 
 
-class UnexplainedMotion(msgspec.Struct, frozen=True, gc=False):
-    """Motion that the model does not explain, by cycle: the fields of `model.coefficients.Disturbance`."""
-
-    t_ns: int
-    forward: float
-    left: float
-    curvature_per_m: float
-    drift_x_m_s: float
-    drift_y_m_s: float
-
-
 class GuardVerdict(msgspec.Struct, frozen=True, gc=False):
     """Verdict of the fence guard on the command of one tick, while there is a fence or an obstacle.
 
@@ -332,7 +321,6 @@ Record = (
     | Task
     | Fan
     | Controller
-    | UnexplainedMotion
     | GuardVerdict
     | FenceChange
     | Obstacle
@@ -369,7 +357,6 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/belief", BeliefChange),
     Topic("/adapt", Adaptation),
     Topic("/controller", Controller),
-    Topic("/disturbance", UnexplainedMotion),
     Topic("/fence/guard", GuardVerdict),
     Topic("/fence", FenceChange),
     Topic("/obstacle", Obstacle),

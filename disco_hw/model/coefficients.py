@@ -1,16 +1,11 @@
-"""Coefficients for the compiled step: of one parameter point of a model, or tables of many and the pick of one.
-
-And the motion that no parameter explains (`Disturbance`), as estimation finds it and as the planner rolls it out.
-"""
+"""Coefficients for the compiled step: of one parameter point of a model, or tables of many and the pick of one."""
 
 from __future__ import annotations
 
-import math
 from collections import namedtuple
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
-import msgspec
 import numpy as np
 from numba import types
 from numpy.typing import NDArray
@@ -180,61 +175,3 @@ def _lane_effects(effects: Any, i: types.Type) -> Callable[..., Any]:
 
         return pick
     return lambda effects, i: effects
-
-
-Array = NDArray[np.float64]
-Number = TypeVar("Number", float, Array)
-
-MOVES_RAD_S = 0.5
-"""Wheels that turn this fast together are carried by the ground as much as they ever are; slower ones in proportion."""
-
-
-class Disturbance(msgspec.Struct, frozen=True, gc=False):
-    """Motion of a robot beside its model, each part in the form in which it is constant while the robot turns.
-
-    Of the body, in proportion to its way, so that a robot that stands is not disturbed: `forward`, the part by which it
-    goes farther; `left`, how far it slides to the left for each metre forward; `curvature_per_m`, how far it turns to
-    the left for each metre (rad/m). Of the ground, in the world frame: `drift_x_m_s`, `drift_y_m_s`, as on a slope.
-    """
-
-    forward: float = 0.0
-    left: float = 0.0
-    curvature_per_m: float = 0.0
-    drift_x_m_s: float = 0.0
-    drift_y_m_s: float = 0.0
-
-    @property
-    def is_none(self) -> bool:
-        """Whether all of it is zero."""
-        return not any(msgspec.structs.astuple(self))
-
-    def turning(self, left: Number, right: Number, axial_distance_m: float) -> tuple[Number, Number]:
-        """Wheel speeds or angles that would make an undisturbed robot go on and turn as these make this one."""
-        more = 0.25 * self.curvature_per_m * axial_distance_m * (left + right)
-        scale = 1.0 + self.forward
-        return scale * left - more, scale * right + more
-
-    def commanded(self, left: Number, right: Number, axial_distance_m: float) -> tuple[Number, Number]:
-        """Return the inverse of `turning`."""
-        scale = 1.0 + self.forward
-        more = 0.25 * self.curvature_per_m * axial_distance_m * (left + right) / scale
-        return (left + more) / scale, (right - more) / scale
-
-    def moving(self, left_rad_s: float, right_rad_s: float) -> float:
-        """Return how much the ground carries a robot whose wheels turn at these speeds, from 0 (standing) to 1."""
-        return min((abs(left_rad_s) + abs(right_rad_s)) / MOVES_RAD_S, 1.0)
-
-    @property
-    def slides(self) -> Array:
-        """Sideways parts of the disturbance, (3,) for `FreeRun`: `left`, `drift_x_m_s`, `drift_y_m_s`."""
-        return np.array([self.left, self.drift_x_m_s, self.drift_y_m_s])
-
-    def slide(self, distance_m: float, carried_s: float, yaw_rad: float) -> tuple[float, float]:
-        """Return the slide forward and to the left (m) of a robot with this heading over a short way."""
-        x, y = self.drift_x_m_s * carried_s, self.drift_y_m_s * carried_s
-        cosine, sine = math.cos(yaw_rad), math.sin(yaw_rad)
-        return cosine * x + sine * y, cosine * y - sine * x + self.left * distance_m
-
-
-NO_DISTURBANCE = Disturbance()
-NO_SLIDE = NO_DISTURBANCE.slides

@@ -44,7 +44,8 @@ from disco_hw.model.added_terms import (
     terms_need_change,
     written_out,
 )
-from disco_hw.model.coefficients import MOVES_RAD_S, NO_SLIDE, Base, Coefficients, Integration, base_point, effect_point
+from disco_hw.model.coefficients import Base, Coefficients, Integration, base_point, effect_point
+from disco_hw.model.drift import MOVES_RAD_S, NO_DRIFT_M_S
 from disco_hw.model.model import Model, coefficient_tables
 
 Pose: TypeAlias = tuple[float, float, float, float]
@@ -385,22 +386,22 @@ class FreeRun:
 
     def states(
         self, start: Array, commands: Array, history: int, time_s: float = 0.0, point: int = 0,
-        slide: Array = NO_SLIDE, means: Array | None = None,
+        drift: Array = NO_DRIFT_M_S, means: Array | None = None,
     ) -> Array:  # fmt: skip
         """States (N + 1, 5) from `start` (5,): x, y (m), yaw (rad, not wrapped), wheel speeds (rad/s).
 
         `commands` (history + N, 2) rad/s, each held for a step; the first `history` rows were sent before and must be
         at least `past_rows`. `time_s`: the time at the start, for effects that depend on it. `point`: which of theta.
-        `slide` (3,): how the robot slides beside its model, `Disturbance.slides`. `means` (n,): what the model's terms
-        remember of what acted up to the start, as `PastMotion` gives it, set to what they remember at the end; without
-        them nothing was before.
+        `drift` (2,): how fast the ground carries the moving robot along x and y (m/s). `means` (n,): what the model's
+        terms remember of what acted up to the start, as `PastMotion` gives it, set to what they remember at the end;
+        without them nothing was before.
         """
         states = np.empty((commands.shape[0] - history + 1, 5))
         states[0] = start
         # A fresh copy, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
         copied = np.array(commands, dtype=np.float64, order="C")
         kept = None if not self._has_memory else new_means(self._effects) if means is None else means
-        arguments = states, copied, history, float(time_s), point, slide, kept, self._base, self._effects, self._series
+        arguments = states, copied, history, float(time_s), point, drift, kept, self._base, self._effects, self._series
         if self._run is None:
             self._run = compiled_for(run_states, *arguments)
         self._run(*arguments)
@@ -429,7 +430,7 @@ def simulate(model: Model, commands: Array, step_s: float = 0.02, start: Array |
 
 @kernel_function
 def run_states(
-    states: Array, commands: Array, history: int, time_s: float, point: int, slide: Array, means: Array | None,
+    states: Array, commands: Array, history: int, time_s: float, point: int, drift: Array, means: Array | None,
     base: Base, effects: Coefficients, series: NDArray[np.floating],
 ) -> None:  # fmt: skip
     """Fill `states[1:]` from `states[0]`; as `FreeRun.states`."""
@@ -439,7 +440,7 @@ def run_states(
     wheel_left, wheel_right = states[0, 3], states[0, 4]
     cos_yaw, sin_yaw = math.cos(yaw), math.sin(yaw)
     axle_x, axle_y = axle_of(x, y, cos_yaw, sin_yaw, here)
-    begin_x, begin_y, carried_s = axle_x, axle_y, 0.0
+    carried_s = 0.0
     first_row = history - delay_steps(acting)
     for t in range(states.shape[0] - 1):
         was_left, was_right = wheel_left, wheel_right
@@ -454,8 +455,8 @@ def run_states(
         x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, here)
         turning = 0.5 * (abs(wheel_left + was_left) + abs(wheel_right + was_right))
         carried_s += min(turning / MOVES_RAD_S, 1.0) * integration.step_s
-        states[t + 1, 0] = x + (carried_s * slide[1] - slide[0] * (axle_y - begin_y))
-        states[t + 1, 1] = y + (carried_s * slide[2] + slide[0] * (axle_x - begin_x))
+        states[t + 1, 0] = x + carried_s * drift[0]
+        states[t + 1, 1] = y + carried_s * drift[1]
         states[t + 1, 2] = yaw
         states[t + 1, 3] = wheel_left
         states[t + 1, 4] = wheel_right

@@ -25,7 +25,6 @@ from disco_hw.control.plan import Law, LawController
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.errors import InputError
 from disco_hw.estimation import PoseFusion
-from disco_hw.estimation.correction import DisturbanceEstimator
 from disco_hw.estimation.filter import TAKE_OVER_TIMEOUTS
 from disco_hw.estimation.heading_watch import HeadingWatch
 from disco_hw.estimation.odometry import OdometryParameters
@@ -110,7 +109,6 @@ def create_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipe
         planner=planner,
         governor=Governor(limits, 1.0 / config.control.rate_hz),
         plan_tail_s=config.control.plan_tail_s,
-        disturbance=DisturbanceEstimator() if config.control.disturbance else None,
         means=DriveMeans.of(model),
         headings=HeadingWatch(config.pose.labels(), [one.offset for one in config.pose.every()]),
         guard=create_guard(config, model),
@@ -144,7 +142,6 @@ def create_fast_adaptation(setup: Setup, pipeline: Pipeline) -> FastAdaptation:
         _rehearsed(setup, pipeline),
         *possible_range(setup.config.prior),
         lambda geometry: apply_geometry(pipeline, setup.model, geometry),
-        setup.config.control.disturbance,
     )
 
 

@@ -23,15 +23,15 @@ from numpy.typing import NDArray
 from disco_hw.control import NoValidControl, PlannerState, PlanOutcome, Rollouts, SentCommand, WheelPlan
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.estimation import PoseEstimate, PoseFusion
-from disco_hw.estimation.correction import DisturbanceEstimator, PoseUpdate
+from disco_hw.estimation.correction import PoseUpdate
 from disco_hw.estimation.heading_watch import HeadingWatch
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief
-from disco_hw.model.coefficients import NO_DISTURBANCE, Disturbance
+from disco_hw.model.drift import NO_DRIFT, Drift
 from disco_hw.runtime.fence_guard import IDLE, STOPS_MOTION, FenceGuard, FenceState, corner_deviation_m
 from disco_hw.tasks import PlannedTask
-from drivers.types import PoseSample, Readings
+from drivers.types import Readings
 
 # A tick that comes late may move the command by half a period more than usual, never by the whole time missed.
 _LARGEST_STEP_PERIODS = 1.5
@@ -259,8 +259,7 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     """Result of the pipeline for one tick.
 
     `plan` is this tick's new plan or None, `planner_failure` why there is none; `requested` is what `source` wanted,
-    `command` what the governor lets through (rad/s); `disturbance` what was planned with, None where none is estimated;
-    `fence` what the fence guard made of what was requested.
+    `command` what the governor lets through (rad/s); `fence` what the fence guard made of what was requested.
     """
 
     t_ns: int
@@ -271,7 +270,6 @@ class Tick(msgspec.Struct, frozen=True, gc=False):
     source: Source
     requested: tuple[float, float]
     command: Governed
-    disturbance: Disturbance | None = None
     fence: FenceState = IDLE
 
 
@@ -289,16 +287,14 @@ class Pipeline:
 
     def __init__(
         self, fusion: PoseFusion, planner: Planner, governor: Governor, plan_tail_s: float, guard: FenceGuard,
-        disturbance: DisturbanceEstimator | None = None, means: DriveMeans | None = None,
-        headings: HeadingWatch | None = None,
+        means: DriveMeans | None = None, headings: HeadingWatch | None = None,
     ) -> None:  # fmt: skip
         self.guard = guard
         self._avoids = planner if isinstance(planner, AvoidsBoundaries) else None
         self.fusion = fusion
         self.headings = headings or HeadingWatch([one.label for one in fusion.sources.all])
         self._means = means
-        self._disturbance = disturbance
-        self._drift = NO_DISTURBANCE
+        self._drift = NO_DRIFT
         self._planner = planner
         self._governor = governor
         self._plan_tail_ns = round(plan_tail_s * 1e9)
@@ -307,11 +303,6 @@ class Pipeline:
         self._following = False
         self._last_ns: int | None = None
         self._sent: deque[SentCommand] = deque()
-
-    @property
-    def disturbance(self) -> Disturbance:
-        """Estimated motion of the robot beside its model: all of it, or the drift that came with the belief."""
-        return self._drift if self._disturbance is None else self._disturbance.value
 
     def set_task(self, task: PlannedTask, line_m: NDArray[np.float64] | None = None) -> None:
         """Follow another task of the same kind; what is planned for the present one is dropped.
@@ -328,17 +319,12 @@ class Pipeline:
     ) -> None:
         """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
 
-        `drift_m_s`: how fast the ground carries the moving robot along x and y of the world; it does not count where a
-        disturbance is estimated. Raises ValueError, with everything as it was, if the planner cannot take the belief.
+        `drift_m_s`: how fast the ground carries the moving robot along x and y of the world. Raises ValueError, with
+        everything as it was, if the planner cannot take the belief.
         """
         self._planner.set_belief(belief)
-        if self._disturbance is not None:
-            self._disturbance.change_geometry(self.fusion.parameters, odometry, self.fusion.wheels_rad_s)
-        elif drift_m_s == (0.0, 0.0):
-            self._drift = NO_DISTURBANCE
-        else:
-            self._drift = Disturbance(drift_x_m_s=drift_m_s[0], drift_y_m_s=drift_m_s[1])
-        self.fusion.set_disturbance(self.disturbance)
+        self._drift = NO_DRIFT if drift_m_s == (0.0, 0.0) else Drift(*drift_m_s)
+        self.fusion.set_drift(self._drift)
         self.fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:
@@ -377,7 +363,7 @@ class Pipeline:
         """
         for wheels in readings.wheels:
             self.fusion.add_wheels(wheels)
-        updates = tuple(self._handle_pose(pose, now_ns) for pose in readings.poses)
+        updates = tuple(self.fusion.add_pose(pose, now_ns) for pose in readings.poses)
         self.fusion.sources.step(now_ns)
         estimate = self.fusion.estimate(now_ns)
         if self._means is not None and self._last_ns is not None:
@@ -404,7 +390,6 @@ class Pipeline:
             source=source,
             requested=requested,
             command=command,
-            disturbance=None if self._disturbance is None else self._disturbance.value,
             fence=fence,
         )
 
@@ -422,13 +407,6 @@ class Pipeline:
             return found, requested
         return found, (found.scale * requested[0], found.scale * requested[1])
 
-    def _handle_pose(self, pose: PoseSample, now_ns: int) -> PoseUpdate:
-        update = self.fusion.add_pose(pose, now_ns)
-        if self._disturbance is not None:
-            self._disturbance.add_sample(pose, update, self.fusion.parameters, self.fusion.wheels_rad_s)
-            self.fusion.set_disturbance(self._disturbance.value)
-        return update
-
     def _replan(self, now_ns: int, estimate: PoseEstimate) -> tuple[WheelPlan | None, str | None]:
         if not self._following:
             self._planner.reset()
@@ -441,7 +419,7 @@ class Pipeline:
             left_speed_rad_s=estimate.left_speed_rad_s,
             right_speed_rad_s=estimate.right_speed_rad_s,
             sent=tuple(self._sent),
-            disturbance=self.disturbance,
+            drift=self._drift,
             command_means=() if self._means is None else self._means.commands,
             body_means=() if self._means is None else self._means.body,
         )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Iterator, Sequence
 
-import msgspec
 import numpy as np
 
 from disco_hw.control import Rollouts
@@ -78,8 +77,6 @@ def tick(result: Tick, command: WheelCommand | None, valid_for_s: float) -> Iter
     )
     for update in result.pose_updates:
         yield _innovation(update)
-    if result.disturbance is not None:
-        yield records.UnexplainedMotion(result.t_ns, *msgspec.structs.astuple(result.disturbance))
     if result.plan is not None:
         plan, found = result.plan, result.plan.diagnostics
         left, right = plan.wheel_speeds.T.tolist()

@@ -14,7 +14,7 @@ import msgspec
 
 from disco_hw.adaptation.guard import geometry_of
 from disco_hw.config import RobotConfig
-from disco_hw.control.plan import PLANNER_VERSION, SAME_SINCE_VERSION
+from disco_hw.control.plan import DISTURBANCE_UNTIL_VERSION, PLANNER_VERSION, SAME_SINCE_VERSION
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.log.mcap_log import Metadata
@@ -31,7 +31,6 @@ from disco_hw.log.records import (
     Plan,
     Record,
     Task,
-    UnexplainedMotion,
 )
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
@@ -50,13 +49,12 @@ _TOPICS = (
     "/command",
     "/task",
     "/belief",
-    "/disturbance",
     "/fence/guard",
     "/fence",
     "/obstacle",
     "/controller",
 )
-_COMPARED = (Estimate, Innovation, UnexplainedMotion, Plan, Command)
+_COMPARED = (Estimate, Innovation, Plan, Command)
 # Whether a command went out is the driver's part, which is not replayed.
 _NOT_REPLAYED = {(Command, "in_force"), (Command, "valid_for_s")}
 _FLOAT = struct.Struct("<d")
@@ -160,6 +158,11 @@ def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata, has_plans
             f"{PLANNER_VERSION}; replay it with disco-hw {recorded.version or 'of the version that recorded it'}"
         )
     control = setup.config.control
+    if control.disturbance and planner <= DISTURBANCE_UNTIL_VERSION:
+        raise InputError(
+            f"{path}: it was driven with control.disturbance, which is followed no more; replay it with "
+            f"disco-hw {recorded.version or 'of the version that recorded it'}"
+        )
     if planner >= SAME_SINCE_VERSION or control.mode != "default" or not has_plans:
         return setup
     if planner > 1:

@@ -74,10 +74,14 @@ def test_old_entries_are_read_and_named():
     assert 'write "fast"' in deprecated.why
     # The rate of the poses once decided whether the geometry is learnt.
     for adaptation in ("auto", "off"):
-        slow = choose_adaptation(Control(adaptation=adaptation), PoseInput(rate_hz=2.0), MODEL)
-        assert slow.kind == ("fast" if adaptation == "auto" else "off")
-        assert "remove pose.rate_hz" in slow.report
-    assert "remove control.disturbance" in choose_adaptation(Control(disturbance=True), PoseInput(), MODEL).report
+        old = choose_adaptation(Control(adaptation=adaptation, disturbance=True), PoseInput(rate_hz=2.0), MODEL)
+        assert old.kind == ("fast" if adaptation == "auto" else "off")
+        assert "remove pose.rate_hz" in old.report
+        assert "remove control.disturbance" in old.report
+    # Also where the planner's mode does not allow it.
+    impossible = choose_adaptation(Control(uncertainty="point", disturbance=True), PoseInput(), MODEL)
+    assert impossible.kind == "off"
+    assert "remove control.disturbance" in impossible.report
 
 
 def test_the_range_is_the_prior_as_far_as_it_is_possible():

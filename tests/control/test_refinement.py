@@ -131,9 +131,9 @@ def test_warming_up_compiles_the_refinement() -> None:
 
 
 def test_plans_are_refined_except_in_two_modes() -> None:
-    """The paper's mode is to stay as it is, and an estimated disturbance would make refined commands restless."""
+    """The paper's mode is to stay as it is."""
     assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), DiscoSettings(), LIMITS).refinement is not None
-    for settings in (DiscoSettings.paper(), DiscoSettings(refine=False), DiscoSettings(offset_free=True)):
+    for settings in (DiscoSettings.paper(), DiscoSettings(refine=False)):
         assert Disco(MODEL, CircleCost(radius_m=RADIUS_M), settings, LIMITS).refinement is None
 
 

@@ -11,10 +11,10 @@ from msgspec import structs
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control.optimiser import Optimiser
 from disco_hw.control.past_motion import DriveMeans
-from disco_hw.control.plan import PLANNER_VERSION
+from disco_hw.control.plan import DISTURBANCE_UNTIL_VERSION, PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
-from disco_hw.log.records import Command, Plan, UnexplainedMotion
+from disco_hw.log.records import Command, Plan
 from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
@@ -50,28 +50,6 @@ def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
     report = replayed(write_log(tmp_path / "run.mcap", ticks))
     assert report.ticks == len(ticks)
     assert report.values > 5000
-
-
-@pytest.mark.thorough
-def test_what_no_parameter_explains_is_recorded_and_replays_bit_for_bit(tmp_path):
-    text = ROBOT_TEXT.replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
-    (tmp_path / "robot.toml").write_text(text)
-    stack = simulated_stack(robot_file=tmp_path / "robot.toml")
-    start(stack, 2.5)
-    ticks = stack.recorder.ticks
-    found = [one for _, records in ticks for one in records if isinstance(one, UnexplainedMotion)]
-    assert len(found) == len(ticks)
-    assert found[0].forward == 0.0 != found[-1].forward
-    assert abs(found[-1].drift_x_m_s) + abs(found[-1].drift_y_m_s) > 0.0
-    assert stack.core.last.pipeline.disturbance.forward == found[-1].forward
-    replayed(write_log(tmp_path / "run.mcap", ticks, text))
-    wrong = [
-        (now, [structs.replace(one, left=0.1) if isinstance(one, UnexplainedMotion) else one for one in records])
-        for now, records in ticks
-    ]
-    report = replay(write_log(tmp_path / "wrong.mcap", wrong, text))
-    assert report.difference is not None
-    assert report.difference.field == "UnexplainedMotion.left"
 
 
 @pytest.mark.thorough
@@ -207,3 +185,10 @@ def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
     odd = write_log(tmp_path / "odd.mcap", ticks[:1], model="format = 7\n")
     with pytest.raises(InputError, match=rf"^{odd}: model\.toml: format: "):
         replay(odd)
+
+
+def test_a_drive_that_followed_a_disturbance_is_refused_and_one_that_did_not_is_replayed(tmp_path, ticks):
+    text = (ROBOTS / "wombot.toml").read_text().replace("rate_hz = 50.0", "rate_hz = 50.0\ndisturbance = true")
+    with pytest.raises(InputError, match=r"driven with control\.disturbance, which is followed no more; replay it"):
+        replay(write_log(tmp_path / "old.mcap", ticks, text, planner=DISTURBANCE_UNTIL_VERSION))
+    replayed(write_log(tmp_path / "new.mcap", ticks, text))

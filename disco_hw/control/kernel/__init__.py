@@ -53,10 +53,10 @@ WHEEL_STRIDE = U(2) * BLOCK
 WHEEL_ROWS = 3
 
 # Places in the start of a rollout: position relative to the task's origin (m), heading, wheel speeds (rad/s), time (s),
-# the task's memory; how far the ground carries the robot in a step (m), and how far it slides left for each metre.
+# the task's memory; how far the ground carries the robot in a step (m).
 START_X, START_Y, START_COS, START_SIN, START_LEFT, START_RIGHT, START_TIME, START_MEMORY = range(8)
-CARRIED_X, CARRIED_Y, SLIDES_LEFT = range(8, 11)
-START_SIZE = 11
+CARRIED_X, CARRIED_Y = 8, 9
+START_SIZE = 10
 
 CHANNELS = 2
 """Commands of a skid-steer robot: left and right."""

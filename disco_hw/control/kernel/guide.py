@@ -19,7 +19,6 @@ from typing import NamedTuple
 from disco_hw.control.kernel import (
     CARRIED_X,
     CARRIED_Y,
-    SLIDES_LEFT,
     START_COS,
     START_LEFT,
     START_MEMORY,
@@ -34,7 +33,7 @@ from disco_hw.control.kernel import (
 )
 from disco_hw.control.kernel.sequences import Limits, clip
 from disco_hw.jit import kernel_function, scalar_function
-from disco_hw.model.coefficients import MOVES_RAD_S
+from disco_hw.model.drift import MOVES_RAD_S
 
 # The law's gains (1/m): of the heading, and of the distance, which the robot comes back from at this angle a metre.
 YAW_PER_M, ANGLE_PER_M = 9.0, 3.3
@@ -72,7 +71,7 @@ def guide(
 ) -> None:  # fmt: skip
     """Fill `commands` (T, 2) with the wheel speeds (rad/s) of the steering law.
 
-    They start from the state `start` (11,) of `SkidSteer` and the commands before, and stay within the limits.
+    They start from the state `start` (10,) of `SkidSteer` and the commands before, and stay within the limits.
     """
     x, y = float(start[START_X]), float(start[START_Y])
     cos_yaw, sin_yaw = float(start[START_COS]), float(start[START_SIN])
@@ -112,7 +111,7 @@ def guide(
         turned = chassis.wheel_radius_m * step_s * (mean_right - mean_left) / chassis.axial_distance_m
         cos_half, sin_half = math.cos(0.5 * turned), math.sin(0.5 * turned)
         cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
-        aside = turned * x_icr_m - moved * start[SLIDES_LEFT]
+        aside = turned * x_icr_m
         carried = min((abs(mean_left) + abs(mean_right)) / MOVES_RAD_S, 1.0)
         x += moved * cos_yaw + aside * sin_yaw + carried * start[CARRIED_X]
         y += moved * sin_yaw - aside * cos_yaw + carried * start[CARRIED_Y]
@@ -144,7 +143,7 @@ def timed_reference(
 ) -> None:  # fmt: skip
     """Fill `reference` (T, 2) with points (m), relative to the task's origin.
 
-    `start` (11,) is the state of `SkidSteer`. Sets `found` (6,): distance to the line (m), cosine of the angle between
+    `start` (10,) is the state of `SkidSteer`. Sets `found` (6,): distance to the line (m), cosine of the angle between
     the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do,
     at most 1, that heading at the end (cosine, sine), and the length of the way from the first point to the last (m).
     And `beyond` (N, 2): that last point, and those behind it along the line, `beyond_m` apart.

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from disco_hw.jit import block_function, kernel_function, scalar_function
-from disco_hw.model.coefficients import MOVES_RAD_S, Base, Coefficients, Integration, base_point, effect_point
+from disco_hw.model.coefficients import Base, Coefficients, Integration, base_point, effect_point
+from disco_hw.model.drift import MOVES_RAD_S
 from disco_hw.model.step import axle_of, delay_steps, in_force, integration_from, step, tracked_of
 
 # Left and right, as of `disco_hw.control.kernel`.
@@ -37,8 +38,8 @@ Array = NDArray[Any]
 class Problem(NamedTuple):
     """Least-squares problem of a refinement: initial state, model coefficients, command bounds and reference.
 
-    `start` (5,): x, y (m, relative to the task's origin), yaw (rad), wheel speeds (rad/s); `time_s` of it; `slide` (3,)
-    as of `Disturbance.slides`; `means` (n,) of what the model's terms remember at the start, or None; `base`,
+    `start` (5,): x, y (m, relative to the task's origin), yaw (rad), wheel speeds (rad/s); `time_s` of it; `drift` (2,)
+    of the ground (m/s); `means` (n,) of what the model's terms remember at the start, or None; `base`,
     `effects` (tables of one point), `series`: coefficients. `history`: rows of commands from before the plan.
     `reference` (T, 2) in m. `largest`, `change`: bounds of a command and of its change in a step (rad/s); `before`
     (2,): the command before the plan; `change_m`: distance (m) that costs as much as a change of 1 rad/s.
@@ -48,7 +49,7 @@ class Problem(NamedTuple):
 
     start: Array
     time_s: float
-    slide: Array
+    drift: Array
     means: Array | None
     base: Base
     effects: Coefficients
@@ -99,7 +100,7 @@ def _begin(states: Array, start: Array, base: Base) -> None:
 
 @block_function
 def _roll(
-    states: Array, first: int, commands: Array, history: int, time_s: float, slide: Array, remembered: Array | None,
+    states: Array, first: int, commands: Array, history: int, time_s: float, drift: Array, remembered: Array | None,
     base: Base, effects: Coefficients, integration: Integration,
 ) -> None:  # fmt: skip
     """Fill the rows of `states` behind row `first` from that row."""
@@ -119,8 +120,8 @@ def _roll(
         states[t + 1, AXLE_X], states[t + 1, AXLE_Y] = axle_x, axle_y
         states[t + 1, COS], states[t + 1, SIN] = cos_yaw, sin_yaw
         states[t + 1, LEFT], states[t + 1, RIGHT], states[t + 1, CARRIED] = wheel_left, wheel_right, carried_s
-        states[t + 1, X] = x + (carried_s * slide[1] - slide[0] * (axle_y - states[0, AXLE_Y]))
-        states[t + 1, Y] = y + (carried_s * slide[2] + slide[0] * (axle_x - states[0, AXLE_X]))
+        states[t + 1, X] = x + carried_s * drift[0]
+        states[t + 1, Y] = y + carried_s * drift[1]
 
 
 @block_function
@@ -159,7 +160,7 @@ def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
     base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
     _store_memory(buffers.remembered, problem.means)
     _begin(states, problem.start, base)
-    _roll(states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration)
+    _roll(states, 0, commands, history, problem.time_s, problem.drift, buffers.remembered, base, effects, integration)
     turned = _last_residual(problem, states)
     cost = turned * turned
     for t in range(problem.reference.shape[0]):
@@ -185,7 +186,7 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
     _store_memory(buffers.remembered, problem.means)
     _begin(states, problem.start, base)
-    _roll(states, 0, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects, integration)
+    _roll(states, 0, commands, history, problem.time_s, problem.drift, buffers.remembered, base, effects, integration)
     for t in range(steps):
         residuals[RESIDUALS * t], residuals[RESIDUALS * t + 1] = _residual(problem, states, t)
     residuals[size] = _last_residual(problem, states)
@@ -200,7 +201,7 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
         kept = commands[history + k, c]
         commands[history + k, c] = kept + DIFFERENCE_RAD_S
         _roll(
-            moved, first, commands, history, problem.time_s, problem.slide, buffers.remembered, base, effects,
+            moved, first, commands, history, problem.time_s, problem.drift, buffers.remembered, base, effects,
             integration,
         )  # fmt: skip
         commands[history + k, c] = kept

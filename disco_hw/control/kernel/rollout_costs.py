@@ -15,8 +15,6 @@ from disco_hw.control.kernel import (
     AXLE_X,
     AXLE_Y,
     BLOCK,
-    CARRIED_X,
-    CARRIED_Y,
     COLUMNS,
     COS,
     FORWARD,
@@ -28,7 +26,6 @@ from disco_hw.control.kernel import (
     SCALED0,
     SCALED1,
     SIN,
-    SLIDES_LEFT,
     START_COS,
     START_MEMORY,
     START_SIN,
@@ -61,7 +58,7 @@ from disco_hw.control.kernel.avoid import (
 from disco_hw.jit import bits_of_float, block_function, cast_like, float_from_bits, int32, scalar_function, tune_loops
 from disco_hw.model.coefficients import Base, lane_base
 from disco_hw.model.step import tracked_of
-from disco_hw.tasks import Found, constant
+from disco_hw.tasks import Found
 
 Absent: TypeAlias = bool | None
 """None, or anything else: whether a part is there, known to the compiler."""
@@ -69,8 +66,6 @@ BasePair: TypeAlias = tuple[Base, Base] | None
 """Return base coefficients of a pair of points."""
 Place: TypeAlias = tuple[float, float, float]
 """Tracked point x, y (m) and forward speed (m/s)."""
-SLIDES_FROM_M, MOST_ASIDE = 0.005, 0.4
-"""The least way of a step, and the largest tangent, by which the angle is taken at which a robot slides aside."""
 
 
 @scalar_function
@@ -305,30 +300,12 @@ def _any_place(
     return _scaled_place(state, b, base, other, start)
 
 
-@scalar_function
-def sliding_heading(
-    slides: Absent, cos_yaw: float, sin_yaw: float, forward_m: float, start: Floats
-) -> tuple[float, float]:
-    """Heading of an undisturbed robot that would go where this one slides to, which goes so far forward in a step."""
-    if slides is None:
-        return cos_yaw, sin_yaw
-    one = constant(1.0, forward_m)
-    way = max(forward_m, constant(SLIDES_FROM_M, forward_m))
-    aside = start[SLIDES_LEFT] + (cos_yaw * start[CARRIED_Y] - sin_yaw * start[CARRIED_X]) / way
-    aside = min(max(aside, -constant(MOST_ASIDE, forward_m)), constant(MOST_ASIDE, forward_m))
-    scale = one / math.sqrt(one + aside * aside)
-    return (cos_yaw - aside * sin_yaw) * scale, (sin_yaw + aside * cos_yaw) * scale
-
-
 @block_function
-def end_costs(
-    costs: Floats, at: int, state: Floats, point: int, slides: Absent, start: Floats, step_s: float, task: Terms
-) -> None:
+def end_costs(costs: Floats, at: int, state: Floats, point: int, task: Terms) -> None:
     """Write the costs of the rows from `point` on to `costs[at:at + BLOCK]`."""
     tune_loops()
     for b in range(BLOCK):
-        cos_yaw, sin_yaw = sliding_heading(slides, state[COS + b], state[SIN + b], state[FORWARD + b] * step_s, start)
         costs[at + b] = state[point + TOTAL + b] + terminal_cost(
-            task, state[point + MEMORY + b], state[point + X + b], state[point + Y + b], cos_yaw, sin_yaw,
-            _found(looks_up(task), state, point, b),
+            task, state[point + MEMORY + b], state[point + X + b], state[point + Y + b], state[COS + b],
+            state[SIN + b], _found(looks_up(task), state, point, b),
         )  # fmt: skip

@@ -19,8 +19,6 @@ from disco_hw.control.kernel import (
     AXLE_Y,
     BLOCK,
     BODY_REMEMBERED,
-    CARRIED_X,
-    CARRIED_Y,
     CHANNELS,
     COS,
     DIFFERENCE,
@@ -32,7 +30,6 @@ from disco_hw.control.kernel import (
     SCALED0,
     SCALED1,
     SIN,
-    SLIDES_LEFT,
     START_COS,
     START_LEFT,
     START_RIGHT,
@@ -63,7 +60,6 @@ from disco_hw.control.kernel.rollout_costs import (
 from disco_hw.jit import block_function, cast_like, scalar_function, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
-    MOVES_RAD_S,
     Base,
     Coefficients,
     Integration,
@@ -82,7 +78,6 @@ from disco_hw.model.step import (
     wheel_step,
     wheels_follow,
 )
-from disco_hw.tasks import constant
 
 Pairs: TypeAlias = NDArray[np.int64] | None
 """For each of L points the two that are equivalent to it in one way, (L, 2), or None."""
@@ -93,8 +88,7 @@ CostPlaces: TypeAlias = tuple[np.uintp, np.uintp] | None
 class SkidSteer(NamedTuple):
     """A skid-steer robot before its task.
 
-    `start` (11,): at the package's places START_X to SLIDES_LEFT. `slides`: None, or anything else if the last three
-    count (`Disturbance`); the ground carries equivalent points in proportion to their size.
+    `start` (10,): at the package's places START_X to CARRIED_Y.
     `means` (L, n): what the terms of each point remember at the start, of commands first, or None where none remembers.
     `base`, `effects`: coefficient tables of L points; `each` is None, or anything else if the
     tables hold points for every sample, (L, K'). `ahead`, `scaled` (L, 2) int or None: pairs of points that
@@ -106,7 +100,6 @@ class SkidSteer(NamedTuple):
     """
 
     start: Floats
-    slides: Absent
     means: Floats | None
     base: Base
     effects: Coefficients
@@ -190,23 +183,8 @@ def _rolling(
 
 
 @scalar_function
-def _slid(
-    slides: Absent, x: float, y: float, step_x: float, step_y: float, wheel_sum: float, difference: float, start: Floats
-) -> tuple[float, float]:
-    """Return the position x, y after this step with the side slip and drift that the disturbance adds to the model."""
-    if slides is None:
-        return x, y
-    # The larger of both is the sum of the wheels' sizes.
-    turned = max(abs(wheel_sum), abs(difference)) * constant(1.0 / MOVES_RAD_S, x)
-    carried = min(turned, constant(1.0, x))
-    left = start[SLIDES_LEFT]
-    return x + (carried * start[CARRIED_X] - left * step_y), y + (carried * start[CARRIED_Y] + left * step_x)
-
-
-@scalar_function
 def _move(
     state: Floats, b: int, rolling: Place, time_s: float, base: Base, effects: Coefficients, integration: Integration,
-    slides: Absent, start: Floats,
 ) -> None:  # fmt: skip
     """Move sample b on by one step."""
     wheel_sum, difference, change = rolling
@@ -215,8 +193,6 @@ def _move(
         wheel_sum, difference, change, time_s, base, effects, integration,
         state, BODY_REMEMBERED + b, BLOCK,
     )  # fmt: skip
-    step_x, step_y = axle_x - state[AXLE_X + b], axle_y - state[AXLE_Y + b]
-    axle_x, axle_y = _slid(slides, axle_x, axle_y, step_x, step_y, wheel_sum, difference, start)
     state[AXLE_X + b] = axle_x
     state[AXLE_Y + b] = axle_y
     state[COS + b] = cos_yaw
@@ -227,7 +203,7 @@ def _move(
 @block_function
 def _roll(
     costs: Floats, at: int, ahead_at: CostPlaces, scaled_at: CostPlaces, horizon: int, commands: Floats,
-    first_input: int, wheels: Floats, state: Floats, slides: Absent, start: Floats, means: Floats | None, point: int,
+    first_input: int, wheels: Floats, state: Floats, start: Floats, means: Floats | None, point: int,
     base: Base, skip_mean: Absent, ahead: BasePair, scaled: BasePair, effects: Coefficients, integration: Integration,
     task: Terms, area: Area | None, straight: Absent,
 ) -> None:  # fmt: skip
@@ -260,7 +236,7 @@ def _roll(
                 here, acting = lane_base(base, at + b), lane_effects(effects, at + b)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, first_input, horizon, acting), time_s, here, acting,
-                    integration, slides, start,
+                    integration,
                 )  # fmt: skip
                 follow_points(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         else:
@@ -269,7 +245,7 @@ def _roll(
                 add_costs(state, b, t - 1, here, skip_mean, ahead, scaled, start, task, None, bends)
                 _move(
                     state, b, _rolling(wheels, t, b, commands, first_input, horizon, acting), time_s, here, acting,
-                    integration, slides, start,
+                    integration,
                 )  # fmt: skip
                 follow_points(looks_up(task), state, b, here, skip_mean, ahead, scaled, start, task, bends)
         look_ups(looks_up(task), state, skip_mean, ahead, scaled, task)
@@ -279,13 +255,13 @@ def _roll(
         add_costs(state, b, horizon - 1, lane_base(base, at + b), skip_mean, ahead, scaled, start, task, True, bends)
     # One after the other: a loop that wrote to all at once would not be vectorised.
     if skip_mean is None:
-        end_costs(costs, at, state, POINT, slides, start, integration.step_s, task)
+        end_costs(costs, at, state, POINT, task)
     if ahead_at is not None:
-        end_costs(costs, ahead_at[0], state, AHEAD0, slides, start, integration.step_s, task)
-        end_costs(costs, ahead_at[1], state, AHEAD1, slides, start, integration.step_s, task)
+        end_costs(costs, ahead_at[0], state, AHEAD0, task)
+        end_costs(costs, ahead_at[1], state, AHEAD1, task)
     if scaled_at is not None:
-        end_costs(costs, scaled_at[0], state, SCALED0, slides, start, integration.step_s, task)
-        end_costs(costs, scaled_at[1], state, SCALED1, slides, start, integration.step_s, task)
+        end_costs(costs, scaled_at[0], state, SCALED0, task)
+        end_costs(costs, scaled_at[1], state, SCALED1, task)
 
 
 @scalar_function
@@ -306,7 +282,7 @@ def _roll_points(
     padded: int, block: int, horizon: int, commands: Floats, state: Floats, straight: Absent,
 ) -> None:  # fmt: skip
     integration = integration_from(system.series, system.wide, system.euler)
-    slides, start, means = system.slides, system.start, system.means
+    start, means = system.start, system.means
     wheels, task = system.wheels, system.task
     lane = U(block) * BLOCK
     for i in range(points):
@@ -329,7 +305,7 @@ def _roll_points(
                     integration.step_s,
                 )
             _roll(
-                costs, at, None, None, horizon, commands, first_input, wheels, state, slides, start, means, i,
+                costs, at, None, None, horizon, commands, first_input, wheels, state, start, means, i,
                 system.base, None, None, None, system.effects, integration, task, system.area, straight,
             )  # fmt: skip
         else:
@@ -345,19 +321,19 @@ def _roll_points(
                     if scaled is None:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), None, horizon, commands, first_input, wheels,
-                            state, slides, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None,
+                            state, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None,
                             acting, integration, task, system.area, straight,
                         )  # fmt: skip
                     else:
                         _roll(
                             costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, first_input, wheels, state, slides, start, means, i, here, skip_mean,
+                            commands, first_input, wheels, state, start, means, i, here, skip_mean,
                             _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
                             system.area, straight,
                         )  # fmt: skip
             if alone:
                 _roll(
-                    costs, at, None, None, horizon, commands, first_input, wheels, state, slides, start, means, i, here,
+                    costs, at, None, None, horizon, commands, first_input, wheels, state, start, means, i, here,
                     None, None, None, acting, integration, task, system.area, straight,
                 )  # fmt: skip
 

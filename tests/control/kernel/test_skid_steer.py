@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import assume, example, given, settings
@@ -18,7 +17,6 @@ from disco_hw.control.plan import command_history
 from disco_hw.effects.registry import MOTION_EFFECTS
 from disco_hw.model import EffectSetting, Gaussian, Model
 from disco_hw.model import plain as physics
-from disco_hw.model.coefficients import Disturbance
 from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import FARTHEST_STEP_M, PathCost
@@ -242,62 +240,6 @@ def test_every_effect_that_moves_the_robot_is_tried():
 @examples(quick=6, every=15, base=SLOW_TURNING, values=STATES, commands=COMMANDS, seed=SEEDS)
 def test_costs_and_update_of_the_bare_model(base, values, commands, seed):
     check_against_reference(model_of(base), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
-
-
-def slid(cost, point, mean, found):
-    """The cost of paths of an undisturbed robot as that of one that slides and drifts; the last heading is where to."""
-    radius, axial, x_icr = point
-    # Points of the same turning share one rollout at another scale, and its drift with it.
-    scale = radius / mean[0] if math.isclose(radius / axial, mean[0] / mean[1], rel_tol=1e-9) else 1.0
-    drift_x, drift_y = scale * found.drift_x_m_s, scale * found.drift_y_m_s
-
-    def slid_cost(x, y, yaw, forward):
-        turning = 0.5 * axial * np.diff(yaw, axis=0) / STEP_S / radius
-        seconds = STEP_S * np.minimum((abs(forward / radius - turning) + abs(forward / radius + turning)) / 0.5, 1.0)
-        seconds = np.concatenate([np.zeros((1, x.shape[1])), np.cumsum(seconds, axis=0)])
-        axle_x, axle_y = x + x_icr * np.cos(yaw), y + x_icr * np.sin(yaw)
-        x = x + seconds * drift_x - found.left * (axle_y - axle_y[0])
-        y = y + seconds * drift_y + found.left * (axle_x - axle_x[0])
-        # Points that share a rollout are judged by the heading that it slides with.
-        way = np.maximum(forward[-1] / scale * STEP_S, 0.005)
-        across = np.cos(yaw[-1]) * found.drift_y_m_s - np.sin(yaw[-1]) * found.drift_x_m_s
-        end = yaw.copy()
-        end[-1] += np.arctan(np.clip(found.left + across * STEP_S / way, -0.4, 0.4))
-        along = np.arctan2(y[-1] - CIRCLE.center_y_m, x[-1] - CIRCLE.center_x_m) + 0.5 * math.pi
-        against = [CIRCLE.against_m * np.maximum(-np.cos(one[-1] - along), 0.0) for one in (yaw, end)]
-        return cost(x, y, end, forward) + against[0] - against[1]
-
-    return slid_cost
-
-
-@pytest.mark.thorough
-@settings(max_examples=15)
-@given(
-    base=SLOW_TURNING,
-    values=STATES,
-    commands=COMMANDS,
-    slides=st.tuples(st.floats(-0.3, 0.3), st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
-    seed=SEEDS,
-)
-def test_costs_of_a_robot_that_slides_aside_and_drifts(base, values, commands, slides, seed):
-    model, state = model_of(base), state_of(values, commands)
-    left, drift_x_m_s, drift_y_m_s = slides
-    found = Disturbance(left=left, drift_x_m_s=drift_x_m_s, drift_y_m_s=drift_y_m_s)
-    state = msgspec.structs.replace(state, disturbance=found)
-    disco = Disco(model, CIRCLE, replace(PLAN_SETTINGS, offset_free=True), LIMITS, seed)
-    before = disco.plan(state.t_ns, state).wheel_speeds
-    disco.plan(state.t_ns, state)
-    commands = sampled_commands(disco, before, SAMPLER, state)
-    theta, weights = unscented_points(model, PLAN_SETTINGS.ut_alpha)
-    start = physics.RobotState(*values)
-    past = command_history(state.sent, state.t_ns, STEP_S, 8, values[3:])
-    cost = circle_cost(CIRCLE, STEP_S, disco.chassis.x_icr_m)
-    got = disco.optimiser.work.point_costs.reshape(weights.size, -1)[:, :SAMPLES].astype(float)
-    for point, costs in zip(theta[weights != 0.0], got[weights != 0.0], strict=True):
-        named = physics.theta_of(model.parameter_names, point)
-        expected = oracle.point_costs(named, start, commands, past, STEP_S, slid(cost, point, base, found))
-        apart = ~np.isclose(costs, expected, atol=1e-3, rtol=RELATIVE)
-        assert apart.mean() < FEW / 10
 
 
 @pytest.mark.thorough
