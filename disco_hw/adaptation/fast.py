@@ -70,7 +70,7 @@ class FastAdaptation:
         moved = filtered.poses > max(self._poses, LEAST_POSES)
         self._poses = filtered.poses
         covariance = filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)]
-        geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s)
+        geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s, filtered.lateral_lag_s)
         if not moved or not self._is_significant(geometry):
             return AdaptationUpdate(events=events)
         fault = geometry_fault(geometry, self._low, self._high)
@@ -110,6 +110,7 @@ class FastAdaptation:
             "std": dict(zip(NAMES, self._in_force.std.tolist(), strict=True)),
             "covariance": self._in_force.covariance.ravel().tolist(),
             "drift_m_s": list(self._in_force.drift_m_s),
+            "lateral_lag_s": self._in_force.lateral_lag_s,
             "misfit": self._filter.innovation_ratio,
             **self._counts,
         }
@@ -124,7 +125,12 @@ class FastAdaptation:
         moved = np.abs(geometry.mean - old.mean) > SIGNIFICANT_STD * np.minimum(geometry.std, old.std)
         carried_m_s = math.dist(geometry.drift_m_s, old.drift_m_s)
         resized = (width < SIGNIFICANT_WIDTH) | (width > 1.0 / SIGNIFICANT_WIDTH)
-        return bool(moved.any() or resized.any()) or carried_m_s > SIGNIFICANT_STD * self._filter.drift_std_m_s
+        lags_s = abs(geometry.lateral_lag_s - old.lateral_lag_s)
+        return (
+            bool(moved.any() or resized.any())
+            or carried_m_s > SIGNIFICANT_STD * self._filter.drift_std_m_s
+            or lags_s > SIGNIFICANT_STD * self._filter.lateral_lag_std_s
+        )
 
     def _new_messages(self) -> tuple[str, ...]:
         """Sentences on what the filter noticed since the last time."""
@@ -158,4 +164,6 @@ def change_record(now_ns: int, source: str, geometry: Geometry | None, why: str)
     if geometry is None:
         return records.BeliefChange(now_ns, source, reason=why)
     mean, covariance = tuple(geometry.mean.tolist()), tuple(geometry.covariance.ravel().tolist())
-    return records.BeliefChange(now_ns, source, NAMES, mean, covariance, why, *geometry.drift_m_s)
+    return records.BeliefChange(
+        now_ns, source, NAMES, mean, covariance, why, *geometry.drift_m_s, geometry.lateral_lag_s
+    )

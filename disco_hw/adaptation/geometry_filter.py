@@ -35,6 +35,9 @@ SLIP_STD, SLIP_S = 0.035, 0.2
 """Slip of a wheel as a part of its way, and how long it lasts."""
 LAG_S, LAG_STD_S = 0.03, 0.03
 """Of the pose behind the wheels: what is believed at first, and its standard deviation."""
+LATERAL_LAG_S, LATERAL_LAG_STD_S, LONGEST_LATERAL_LAG_S = 0.03, 0.03, 0.2
+"""How long the body's sideways speed lags behind its turning: what is believed at first, its standard deviation, and
+the most that is possible."""
 DRIFT_PER_SQRT_M, DRIFT_PER_SQRT_RAD = 0.001, 0.002
 """Random walk, by size: of the radius over a metre driven, of axle and x_icr over a radian turned."""
 LEAST_STD = 0.002
@@ -73,15 +76,17 @@ _WAIT_NS = 600_000_000
 them in must not have to follow seconds of wheels at once, nor keep them for ever."""
 # Below a count of usual encoders: nothing turned.
 _STATIONARY_RAD = 1e-4
-_SLIDING_S, _SLIDING_STD_S = 0.04, 0.04
-"""How long the body's sideways speed lags behind its turning."""
+# Keeps a quotient finite.
+_SHORTEST_LAG_S = 1e-4
+_SLIDING_STD_S = 0.04
+"""What of that comes and goes by itself."""
 _STRIDE_S = 0.045
 """Wheel samples between two poses are followed together, along one arc, for so long."""
 _ROUGH_M, _ASIDE_M, _ROUGH_RAD = 5e-4, 7e-4, 5e-4
 """Random part of a centimetre driven, along it, to its sides and in heading, which the wheels do not show."""
-_X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG, _DRIFT_X, _DRIFT_Y = range(11)
+_X, _Y, _YAW, _RADIUS, _AXLE, _X_ICR, _LEFT, _RIGHT, _LAG, _LATERAL_LAG, _DRIFT_X, _DRIFT_Y = range(12)
 # Length of the state above.
-_SIZE = 11
+_SIZE = 12
 _DRIFTS = [_DRIFT_X, _DRIFT_Y]
 # Rows of the filter that is believed, and of the one with the other ground.
 _BELIEVED, _OTHER_GROUND = 0, 1
@@ -91,12 +96,14 @@ _DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(_SIZE)
 
 
 class _Bank:
-    """Some filters, each a row of `state` (N, 11) and `covariance` (N, 11, 11) in the order above."""
+    """Some filters, each a row of `state` (N, 12) and `covariance` (N, 12, 12) in the order above."""
 
     def __init__(self, theta: Array, covariance: Array) -> None:
         self.state, self.covariance = np.zeros((1, _SIZE)), np.zeros((1, _SIZE, _SIZE))
         self.state[0, _THETA], self.covariance[0, _THETA, _THETA] = theta, covariance
         self.state[0, _LAG], self.covariance[0, _LAG, _LAG] = LAG_S, LAG_STD_S**2
+        self.state[0, _LATERAL_LAG] = LATERAL_LAG_S
+        self.covariance[0, _LATERAL_LAG, _LATERAL_LAG] = LATERAL_LAG_STD_S**2
         self._velocity, self._sliding_rad_s = np.zeros((1, 3)), np.zeros(1)
 
     @property
@@ -119,15 +126,18 @@ class _Bank:
         x_by_turn = -0.5 * way * sine + x_icr * (sine + 0.5 * turn * cosine)
         y_by_turn = 0.5 * way * cosine - x_icr * (cosine - 0.5 * turn * sine)
         # A body that begins or ends a turn slides to its new motion.
-        lags_rad_s = turn / dt_s - self._sliding_rad_s
-        slides = 1.0 - math.exp(-dt_s / _SLIDING_S)
-        sideways = turn - lags_rad_s * _SLIDING_S * slides
+        lags_rad_s, lag_s = turn / dt_s - self._sliding_rad_s, np.maximum(state[:, _LATERAL_LAG], _SHORTEST_LAG_S)
+        slides = -np.expm1(-dt_s / lag_s)
+        sideways = turn - lags_rad_s * lag_s * slides
         self._sliding_rad_s = self._sliding_rad_s + slides * lags_rad_s
         move_x, move_y = way * cosine + x_icr * sideways * sine, way * sine - x_icr * sideways * cosine
         move_x, move_y = move_x + state[:, _DRIFT_X] * dt_s, move_y + state[:, _DRIFT_Y] * dt_s
         step = np.broadcast_to(np.eye(_SIZE), (len(state), _SIZE, _SIZE)).copy()
         step[:, _X, _YAW], step[:, _Y, _YAW] = -move_y, move_x
         step[:, _X, _X_ICR], step[:, _Y, _X_ICR] = sideways * sine, -sideways * cosine
+        # How much it lags by now is taken as known: to first order a longer lag misses so much more way.
+        missed_m_s = x_icr * lags_rad_s * slides
+        step[:, _X, _LATERAL_LAG], step[:, _Y, _LATERAL_LAG] = -missed_m_s * sine, missed_m_s * cosine
         step[:, _X, _DRIVEN] = by_way * cosine[:, None] + by_turn * x_by_turn[:, None]
         step[:, _Y, _DRIVEN] = by_way * sine[:, None] + by_turn * y_by_turn[:, None]
         step[:, _YAW, _DRIVEN] = by_turn
@@ -172,9 +182,10 @@ class _Bank:
         covariance = self.covariance - gain @ expected @ gain.transpose(0, 2, 1)
         self.covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
         self.state[:, _THETA] = np.clip(self.state[:, _THETA], low, high)
+        self.state[:, _LATERAL_LAG] = np.clip(self.state[:, _LATERAL_LAG], 0.0, LONGEST_LATERAL_LAG_S)
 
     def _with_pose(self) -> Array:
-        """Covariances (N, 11, 3) of the state with the pose that is measured."""
+        """Covariances (N, 12, 3) of the state with the pose that is measured."""
         return self.covariance[:, :, :3] - self.covariance[:, :, _LAG, None] * self._velocity[:, None]
 
     def keep(self, rows: NDArray[np.int64]) -> None:
@@ -199,8 +210,10 @@ class _Bank:
         self.state[:, :3] = np.array([pose.x_m, pose.y_m, pose.yaw_rad]) + self.state[:, _LAG, None] * self._velocity
         self.state[:, _SLIPS] = 0.0
         theta, lag = self.covariance[:, _THETA, _THETA].copy(), self.covariance[:, _LAG, _LAG].copy()
+        lateral = self.covariance[:, _LATERAL_LAG, _LATERAL_LAG].copy()
         self.covariance[:] = 0.0
         self.covariance[:, _THETA, _THETA], self.covariance[:, _LAG, _LAG] = theta, lag
+        self.covariance[:, _LATERAL_LAG, _LATERAL_LAG] = lateral
         spread = np.diag(np.array([pose.position_std_m, pose.position_std_m, pose.yaw_std_rad]) ** 2)
         with_lag = self._velocity * lag[:, None]
         self.covariance[:, :3, :3] = spread + self._velocity[:, :, None] * with_lag[:, None]
@@ -245,6 +258,16 @@ class GeometryFilter:
         """How fast the ground carries the moving robot along x and y of the world."""
         x_m_s, y_m_s = self._bank.state[_BELIEVED, _DRIFTS].tolist()
         return x_m_s, y_m_s
+
+    @property
+    def lateral_lag_s(self) -> float:
+        """How long the body's sideways speed lags behind its turning."""
+        return float(self._bank.state[_BELIEVED, _LATERAL_LAG])
+
+    @property
+    def lateral_lag_std_s(self) -> float:
+        """Standard deviation of that."""
+        return float(np.sqrt(self._bank.covariance[_BELIEVED, _LATERAL_LAG, _LATERAL_LAG]))
 
     @property
     def drift_std_m_s(self) -> float:

@@ -35,11 +35,13 @@ class Geometry:
     """A Gaussian over the geometry in the order of `NAMES`: `mean` (3,), `covariance` (3, 3).
 
     `drift_m_s`: how fast the ground carries the moving robot along x and y of the world, as on a slope.
+    `lateral_lag_s`: how long the body's sideways speed lags behind its turning.
     """
 
     mean: Array
     covariance: Array
     drift_m_s: tuple[float, float] = (0.0, 0.0)
+    lateral_lag_s: float = 0.0
 
     @property
     def std(self) -> Array:
@@ -54,7 +56,7 @@ def geometry_fault(geometry: Geometry, low: Array, high: Array) -> str:
     """
     mean, covariance = geometry.mean, geometry.covariance
     drift_m_s = math.hypot(*geometry.drift_m_s)
-    if not (np.isfinite(mean).all() and np.isfinite(covariance).all() and math.isfinite(drift_m_s)):
+    if not all(np.isfinite(part).all() for part in (mean, covariance, drift_m_s, geometry.lateral_lag_s)):
         return "the estimate is not finite"
     if drift_m_s > LARGEST_DRIFT_M_S:
         return f"the ground would carry the robot by {drift_m_s:.2f} m/s, more than {LARGEST_DRIFT_M_S:g}"
@@ -163,4 +165,4 @@ def geometry_of(change: BeliefChange) -> Geometry | None:
     if change.source == "model":
         return None
     drift_m_s = change.drift_x_m_s, change.drift_y_m_s
-    return Geometry(np.array(change.mean), np.array(change.covariance).reshape(3, 3), drift_m_s)
+    return Geometry(np.array(change.mean), np.array(change.covariance).reshape(3, 3), drift_m_s, change.lateral_lag_s)

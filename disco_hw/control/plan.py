@@ -233,7 +233,8 @@ class SentCommand(msgspec.Struct, frozen=True, gc=False):
 class PlannerState(msgspec.Struct, frozen=True, gc=False):
     """Pose in the world frame and measured wheel speeds at `t_ns`, and the commands sent up to now, oldest first.
 
-    `drift`: of the ground. `command_means`, `body_means`: what the model's terms remember,
+    `drift`: of the ground. `lateral_lag_s`: how long the body's sideways speed lags behind its turning.
+    `command_means`, `body_means`: what the model's terms remember,
     of commands (a pair each) up to the first one of `sent`, of the wheels (a number each) up to `t_ns`; empty if
     nothing was before.
     `elapsed_s`: time since the drive began, for effects that depend on it; None counts from the planner's start.
@@ -248,6 +249,7 @@ class PlannerState(msgspec.Struct, frozen=True, gc=False):
     sent: tuple[SentCommand, ...] = ()
     elapsed_s: float | None = None
     drift: Drift = NO_DRIFT
+    lateral_lag_s: float = 0.0
     command_means: tuple[tuple[float, float], ...] = ()
     body_means: tuple[float, ...] = ()
 

@@ -21,7 +21,8 @@ class PlanStart(NamedTuple):
 
     `state` (5,): x, y (m), yaw (rad), wheel speeds (rad/s) at `t0_ns`, `elapsed_s` after the drive began. `before`: the
     commands that the plan's first change is limited from. `earlier` (history, 2): commands before the plan, in its
-    steps. `drift` (2,): of the ground (m/s). `mean_means` (n,), `point_means` (L, n): what the model's terms remember,
+    steps. `drift` (2,) and `lateral_lag_s`: those of the state. `mean_means` (n,), `point_means` (L, n): what
+    the model's terms remember,
     in the mean of what is believed and under each point; None where they remember nothing.
     """
 
@@ -31,13 +32,14 @@ class PlanStart(NamedTuple):
     before: tuple[float, float]
     earlier: Array
     drift: Array
+    lateral_lag_s: float
     mean_means: Array | None
     point_means: Array | None
 
     @classmethod
     def at_rest(cls, history: int) -> PlanStart:
         """Return the start of a robot that stands at the origin, with so many commands before."""
-        return cls(0, 0.0, np.zeros(5), (0.0, 0.0), np.zeros((history, 2)), NO_DRIFT_M_S, None, None)
+        return cls(0, 0.0, np.zeros(5), (0.0, 0.0), np.zeros((history, 2)), NO_DRIFT_M_S, 0.0, None, None)
 
     def mean_path(self, run: FreeRun, commands: Array) -> Array:
         """Poses (T + 1, 3) that commands (T, 2) lead through in the mean of what is believed."""
@@ -76,7 +78,9 @@ class StatePrediction:
         earlier = np.zeros((0, 2))
         if points.history:
             earlier = self.commands_before(state, t0_ns, self._settings.step_s, points.history)
-        return PlanStart(t0_ns, elapsed_s, predicted, before, earlier, drift, mean_means, point_means)
+        return PlanStart(
+            t0_ns, elapsed_s, predicted, before, earlier, drift, state.lateral_lag_s, mean_means, point_means
+        )  # fmt: skip
 
     def anchor(self, state: PlannerState) -> tuple[float, float]:
         """Commands that the plan's first change is limited from.

@@ -174,7 +174,8 @@ class BeliefChange(msgspec.Struct, frozen=True, gc=False):
 
     `source` is "adapted" for one learnt from the running drive, or "model" for the model file's again, with empty
     arrays. `covariance` is row-major in the order of `names`, SI units. `drift_x_m_s`, `drift_y_m_s`: how fast the
-    ground carries the moving robot in the world frame, as on a slope.
+    ground carries the moving robot in the world frame, as on a slope. `lateral_lag_s`: how long the body's sideways
+    speed lags behind its turning.
     """
 
     t_ns: int
@@ -185,6 +186,7 @@ class BeliefChange(msgspec.Struct, frozen=True, gc=False):
     reason: str = ""
     drift_x_m_s: float = 0.0
     drift_y_m_s: float = 0.0
+    lateral_lag_s: float = 0.0
 
 
 class Adaptation(msgspec.Struct, frozen=True, gc=False):

@@ -162,8 +162,8 @@ def apply_geometry(pipeline: Pipeline, model: Model, geometry: Geometry | None) 
     adapted = model if geometry is None else with_geometry(model, geometry)
     if adapted.belief is None:
         raise ValueError("the model has no belief")
-    drift_m_s = (0.0, 0.0) if geometry is None else geometry.drift_m_s
-    pipeline.set_belief(adapted.belief, odometry_parameters(adapted), drift_m_s)
+    beside = () if geometry is None else (geometry.drift_m_s, geometry.lateral_lag_s)
+    pipeline.set_belief(adapted.belief, odometry_parameters(adapted), *beside)
 
 
 def odometry_parameters(model: Model) -> OdometryParameters:

@@ -294,7 +294,7 @@ class Pipeline:
         self.fusion = fusion
         self.headings = headings or HeadingWatch([one.label for one in fusion.sources.all])
         self._means = means
-        self._drift = NO_DRIFT
+        self._drift, self._lateral_lag_s = NO_DRIFT, 0.0
         self._planner = planner
         self._governor = governor
         self._plan_tail_ns = round(plan_tail_s * 1e9)
@@ -315,16 +315,19 @@ class Pipeline:
         self._plan, self._following = None, False
 
     def set_belief(
-        self, belief: Belief, odometry: OdometryParameters, drift_m_s: tuple[float, float] = (0.0, 0.0)
-    ) -> None:
+        self, belief: Belief, odometry: OdometryParameters, drift_m_s: tuple[float, float] = (0.0, 0.0),
+        lateral_lag_s: float = 0.0,
+    ) -> None:  # fmt: skip
         """Plan and estimate with another geometry from the next step on; plan and estimate in force stay.
 
-        `drift_m_s`: how fast the ground carries the moving robot along x and y of the world. Raises ValueError, with
-        everything as it was, if the planner cannot take the belief.
+        `drift_m_s`: how fast the ground carries the moving robot along x and y of the world. `lateral_lag_s`: how long
+        the body's sideways speed lags behind its turning. Raises ValueError, with everything as it was, if the planner
+        cannot take the belief.
         """
         self._planner.set_belief(belief)
         self._drift = NO_DRIFT if drift_m_s == (0.0, 0.0) else Drift(*drift_m_s)
         self.fusion.set_drift(self._drift)
+        self._lateral_lag_s = lateral_lag_s
         self.fusion.set_parameters(odometry)
 
     def rollouts(self, count: int) -> Rollouts | None:
@@ -420,6 +423,7 @@ class Pipeline:
             right_speed_rad_s=estimate.right_speed_rad_s,
             sent=tuple(self._sent),
             drift=self._drift,
+            lateral_lag_s=self._lateral_lag_s,
             command_means=() if self._means is None else self._means.commands,
             body_means=() if self._means is None else self._means.body,
         )

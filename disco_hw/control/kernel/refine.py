@@ -29,17 +29,36 @@ SWEEPS = 30
 FEASIBLE_RAD_S = 1e-6
 # Shares of a Gauss-Newton step that are tried until one costs less.
 HALVINGS = 3
-AXLE_X, AXLE_Y, COS, SIN, LEFT, RIGHT, CARRIED, X, Y = range(9)
-STATE_COLUMNS = 9
+AXLE_X, AXLE_Y, COS, SIN, LEFT, RIGHT, CARRIED, X, Y, LAGGING = range(10)
+STATE_COLUMNS = 10
 
 Array = NDArray[Any]
+
+
+class LateralLag(NamedTuple):
+    """Lag of a body's sideways speed behind its turning, in steps that all last as long.
+
+    `rate_rad_s`: the yaw rate that the sideways speed goes with at the start. In a step it comes nearer to that of the
+    wheels by `share`, and until then the body misses a way aside as long as it slides in `missing_s` at the difference.
+    """
+
+    rate_rad_s: float
+    share: float
+    missing_s: float
+
+    @classmethod
+    def of(cls, rate_rad_s: float, lag_s: float, step_s: float) -> LateralLag:
+        """Return the lag of `lag_s`, of which none is 0."""
+        share = -math.expm1(-step_s / lag_s) if lag_s > 0.0 else 1.0
+        return cls(float(rate_rad_s), share, lag_s * share)
 
 
 class Problem(NamedTuple):
     """Least-squares problem of a refinement: initial state, model coefficients, command bounds and reference.
 
     `start` (5,): x, y (m, relative to the task's origin), yaw (rad), wheel speeds (rad/s); `time_s` of it; `drift` (2,)
-    of the ground (m/s); `means` (n,) of what the model's terms remember at the start, or None; `base`,
+    of the ground (m/s); `lateral`: how the body's sideways speed lags; `means` (n,) of what the model's terms remember
+    at the start, or None; `base`,
     `effects` (tables of one point), `series`: coefficients. `history`: rows of commands from before the plan.
     `reference` (T, 2) in m. `largest`, `change`: bounds of a command and of its change in a step (rad/s); `before`
     (2,): the command before the plan; `change_m`: distance (m) that costs as much as a change of 1 rad/s.
@@ -50,6 +69,7 @@ class Problem(NamedTuple):
     start: Array
     time_s: float
     drift: Array
+    lateral: LateralLag
     means: Array | None
     base: Base
     effects: Coefficients
@@ -70,7 +90,7 @@ class Buffers(NamedTuple):
 
     `commands` (H + T, 2): the past and the plan that is improved; `tried` the same for what is tried.
     `starts` (2, T, 2): plans to begin from.
-    `states`, `moved` (T + 1, 9); `remembered` (n,) or None; `residuals` (2 T + 1,), `slopes` (N, 2 T + 1);
+    `states`, `moved` (T + 1, 10); `remembered` (n,) or None; `residuals` (2 T + 1,), `slopes` (N, 2 T + 1);
     `normal`, `inverse` (N, N); `gradient`, `step` (N,); `multipliers` (2, 2 N).
     """
 
@@ -90,18 +110,19 @@ class Buffers(NamedTuple):
 
 
 @block_function
-def _begin(states: Array, start: Array, base: Base) -> None:
+def _begin(states: Array, start: Array, lateral: LateralLag, base: Base) -> None:
     """Set row 0 of the states to the start."""
     cos_yaw, sin_yaw = math.cos(start[2]), math.sin(start[2])
     states[0, AXLE_X], states[0, AXLE_Y] = axle_of(start[0], start[1], cos_yaw, sin_yaw, base)
     states[0, COS], states[0, SIN] = cos_yaw, sin_yaw
     states[0, LEFT], states[0, RIGHT], states[0, CARRIED] = start[3], start[4], 0.0
+    states[0, LAGGING] = lateral.rate_rad_s
 
 
 @block_function
 def _roll(
-    states: Array, first: int, commands: Array, history: int, time_s: float, drift: Array, remembered: Array | None,
-    base: Base, effects: Coefficients, integration: Integration,
+    states: Array, first: int, commands: Array, history: int, time_s: float, drift: Array, lateral: LateralLag,
+    remembered: Array | None, base: Base, effects: Coefficients, integration: Integration,
 ) -> None:  # fmt: skip
     """Fill the rows of `states` behind row `first` from that row."""
     first_input = history - delay_steps(effects)
@@ -110,12 +131,17 @@ def _roll(
         left = in_force(commands[recent, 0], commands[older, 0], effects)
         right = in_force(commands[recent, 1], commands[older, 1], effects)
         was_left, was_right = states[t, LEFT], states[t, RIGHT]
-        axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, _ = step(
+        axle_x, axle_y, cos_yaw, sin_yaw, wheel_left, wheel_right, _, half_rate = step(
             states[t, AXLE_X], states[t, AXLE_Y], states[t, COS], states[t, SIN], was_left, was_right, left, right,
             time_s + t * integration.step_s, base, effects, integration, remembered,
         )  # fmt: skip
         turning = 0.5 * (abs(wheel_left + was_left) + abs(wheel_right + was_right))
         carried_s = states[t, CARRIED] + min(turning / MOVES_RAD_S, 1.0) * integration.step_s
+        ahead = 2.0 * half_rate - states[t, LAGGING]
+        missing_m = base.x_icr_m * ahead * lateral.missing_s
+        axle_x -= missing_m * 0.5 * (states[t, SIN] + sin_yaw)
+        axle_y += missing_m * 0.5 * (states[t, COS] + cos_yaw)
+        states[t + 1, LAGGING] = states[t, LAGGING] + ahead * lateral.share
         x, y = tracked_of(axle_x, axle_y, cos_yaw, sin_yaw, base)
         states[t + 1, AXLE_X], states[t + 1, AXLE_Y] = axle_x, axle_y
         states[t + 1, COS], states[t + 1, SIN] = cos_yaw, sin_yaw
@@ -159,8 +185,11 @@ def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
     states, history = buffers.states, problem.history
     base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
     _store_memory(buffers.remembered, problem.means)
-    _begin(states, problem.start, base)
-    _roll(states, 0, commands, history, problem.time_s, problem.drift, buffers.remembered, base, effects, integration)
+    _begin(states, problem.start, problem.lateral, base)
+    _roll(
+        states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
+        integration,
+    )  # fmt: skip
     turned = _last_residual(problem, states)
     cost = turned * turned
     for t in range(problem.reference.shape[0]):
@@ -185,8 +214,11 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     normal, gradient, slopes, residuals = buffers.normal, buffers.gradient, buffers.slopes, buffers.residuals
     base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
     _store_memory(buffers.remembered, problem.means)
-    _begin(states, problem.start, base)
-    _roll(states, 0, commands, history, problem.time_s, problem.drift, buffers.remembered, base, effects, integration)
+    _begin(states, problem.start, problem.lateral, base)
+    _roll(
+        states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
+        integration,
+    )  # fmt: skip
     for t in range(steps):
         residuals[RESIDUALS * t], residuals[RESIDUALS * t + 1] = _residual(problem, states, t)
     residuals[size] = _last_residual(problem, states)
@@ -201,8 +233,8 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
         kept = commands[history + k, c]
         commands[history + k, c] = kept + DIFFERENCE_RAD_S
         _roll(
-            moved, first, commands, history, problem.time_s, problem.drift, buffers.remembered, base, effects,
-            integration,
+            moved, first, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base,
+            effects, integration,
         )  # fmt: skip
         commands[history + k, c] = kept
         for t in range(k, steps):
