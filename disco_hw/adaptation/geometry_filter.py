@@ -1,9 +1,10 @@
 """Extended Kalman filters that learn the geometry with the pose: seconds after a change they follow.
 
 State: x, y, yaw; wheel radius, axial distance, x_icr; the slip of either wheel, which comes and goes by itself (a
-first-order Gauss-Markov process); and how long the measured pose lags behind the wheels: tyres build up their force
-over some way, a body has inertia, a time stamp is not exact. Without it the yaw that a corner begins with looks like a
-larger axle. Driven by the turns of the wheels, corrected by the poses at their own time stamps.
+first-order Gauss-Markov process); how long the measured pose lags behind the wheels: tyres build up their force over
+some way, a body has inertia, a time stamp is not exact; and how long the body's sideways speed lags behind its turning.
+Without the first lag the yaw that a corner begins with looks like a larger axle. Driven by the turns of the wheels,
+corrected by the poses at their own time stamps.
 
 One filter is believed. Beside it run some that say "the robot has just changed": copies whose parameters, all of them
 or one, were opened at different times. One that has explained the poses since then so much better that this outweighs

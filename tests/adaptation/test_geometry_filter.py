@@ -193,6 +193,16 @@ def test_level_ground_carries_nobody(command):
     assert found.drift_m_s == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("lag_s", [0.08, pytest.param(0.01, marks=pytest.mark.thorough)])
+def test_how_late_the_body_slides_behind_its_turning_is_learnt(lag_s):
+    found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL, side_s=lag_s), (0.0, 0.0, 0.3), 1)
+    for _ in range(12):
+        drive(found, plant, TURN, 0.8)
+        drive(found, plant, TURN[::-1], 0.8)
+    assert found.lateral_lag_s == pytest.approx(lag_s, abs=0.015)
+    assert found.lateral_lag_std_s < 0.015
+
+
 def test_wheels_without_poses_are_not_kept_and_the_filter_learns_afterwards():
     found, plant = learner(), ForeignPlant(ForeignRobot(*NOMINAL), (0.0, 0.0, 0.3), 1)
     for _ in range(500):

@@ -21,6 +21,13 @@ EFFECTS = {
 
 
 @pytest.mark.long
+def test_a_body_that_slides_late_stays_on_a_slalom():
+    contender = disco(DiscoSettings.for_speed(0.3, 50.0), learns=True)
+    robot = replace(ForeignRobot(*NOMINAL), side_s=0.08)
+    assert drive(contender, robot, tracks(0.3)["slalom"]).after().rms_mm < 4.0
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("way", ["circle", "eight"])
 @pytest.mark.parametrize("effect", EFFECTS)
 def test_no_effect_leaves_more_than_four_millimetres(effect, way):
