@@ -3,11 +3,10 @@ import numpy as np
 from disco_hw.inference.checks import CHECKS, Predictive, edge_parameters, predictive
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import noise_of
-from disco_hw.inference.simulate import NAMES, Simulator
+from disco_hw.inference.simulate import Simulator
 from disco_hw.model import Model
-from tests.inference.drives import TRUTH, logged
+from tests.inference.drives import THETA, logged
 
-THETA = np.array([TRUTH[name] for name in NAMES])
 LOW, HIGH = np.array([0.0, 0.005, 0.1]), np.array([0.5, 0.5, 0.5])
 
 
