@@ -12,6 +12,7 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
@@ -115,6 +116,17 @@ def body_channel(seed=0, **effects):
     noise = np.random.default_rng(seed).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
     channel = body_on(line, clean + noise)
     return channel, channel.drive
+
+
+def errors_of_size(position_m, yaw_rad, squares=None, **more):
+    """Errors of predictions of this size, with their squares in stretches of time."""
+    return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {}, squares, **more)
+
+
+def errors_in_stretches(squares_m2, squares_rad2):
+    """Errors of predictions whose squares in stretches of time are these."""
+    squares = np.column_stack([squares_m2, squares_rad2]).astype(float)
+    return errors_of_size(*np.sqrt(squares.mean(axis=0)), squares)
 
 
 def of_regression(columns, measured):

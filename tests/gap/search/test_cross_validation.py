@@ -14,7 +14,6 @@ from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,
-    PredictionErrors,
     errors_of,
     floor_errors,
     fold_of,
@@ -28,7 +27,7 @@ from disco_hw.gap.search.cross_validation import (
 from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds
-from tests.gap.synthetic import NOISE, body_channel, body_on, vector_of
+from tests.gap.synthetic import NOISE, body_channel, body_on, errors_in_stretches, vector_of
 
 AHEAD_S = 2.0
 
@@ -120,17 +119,10 @@ def test_stages_are_compared_as_far_ahead_as_runs_are_long(window_s, judged_s):
     assert np.isfinite(errors_of(channel, None, both(channel.neutral), judged_s, poses).position_m)
 
 
-def in_stretches(position, yaw):
-    """Errors whose squares in stretches of time are these."""
-    squares = np.column_stack([position, yaw]).astype(float)
-    size = np.sqrt(squares.mean(axis=0))
-    return PredictionErrors(size[0], (0.0, 1.0), size[1], (0.0, 1.0), 0.0, {}, squares)
-
-
 def test_the_larger_growth_of_position_and_heading_counts():
-    before = in_stretches([1.0] * 6, [4.0] * 6)
-    assert worse_by(before, in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
-    assert worse_by(before, in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
+    before = errors_in_stretches([1.0] * 6, [4.0] * 6)
+    assert worse_by(before, errors_in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
+    assert worse_by(before, errors_in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize(
@@ -146,16 +138,32 @@ def test_the_larger_growth_of_position_and_heading_counts():
     ],
 )
 def test_as_good_as_the_best_is_what_exceeds_it_by_no_more_than_its_growth_scatters(position, yaw, within):
-    best = in_stretches([50.0, 50.0], [0.005, 0.005])
-    other = in_stretches(50.0 + 100.0 * np.array(position), 0.005 + 0.01 * np.array(yaw))
+    best = errors_in_stretches([50.0, 50.0], [0.005, 0.005])
+    other = errors_in_stretches(50.0 + 100.0 * np.array(position), 0.005 + 0.01 * np.array(yaw))
     assert within_one_standard_error(best, other) == within
+
+
+@pytest.mark.parametrize(
+    ("squares", "within"),
+    [
+        ([1.0, 1.0, 1.0, 1.0], True),
+        ([1.3, 0.8, 1.2, 0.8], True),
+        ([1.3, 1.2, 1.1, 1.2], False),
+        # A single stretch says nothing of the scatter.
+        ([1.0], True),
+        ([1.01], False),
+    ],
+)
+def test_errors_are_as_small_as_the_best_within_what_their_difference_scatters(squares, within):
+    best, other = ([1.0] * len(squares),) * 2, (squares,) * 2
+    assert within_one_standard_error(errors_in_stretches(*best), errors_in_stretches(*other)) == within
 
 
 @pytest.mark.parametrize(
     ("position_m", "yaw_rad", "within"), [(2.0, 1.0, True), (2.0, 1.01, False), (1.0, 2.1, False), (0.5, 3.9, True)]
 )
 def test_without_errors_by_stretch_the_best_is_what_errs_least_in_position_times_heading(position_m, yaw_rad, within):
-    best, other = in_stretches([1.0] * 4, [4.0] * 4), in_stretches([position_m**2] * 4, [yaw_rad**2] * 4)
+    best, other = errors_in_stretches([1.0] * 4, [4.0] * 4), errors_in_stretches([position_m**2] * 4, [yaw_rad**2] * 4)
     bare = [replace(one, squares=None) for one in (best, other)]
     for pair in ((bare[0], bare[1]), (best, bare[1]), (bare[0], other)):
         assert within_one_standard_error(*pair) == within
