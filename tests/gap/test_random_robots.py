@@ -25,17 +25,8 @@ def searched():
     log = simulated_drive({"motor_lag": 0.15}, 1, "circle")
     analysis, notes = gap.search_log(log, MODEL)
     predictions = joint_predictions(analysis, final_fit(analysis))
-    return (
-        log,
-        analysis,
-        notes,
-        SimpleNamespace(
-            table=predictions.table().copy,
-            joint=predictions.joint,
-            kept=predictions.kept,
-            errors_of_body=cache(predictions.errors_of_body),
-        ),
-    )
+    made = {"table": predictions.table().copy, "errors_of_body": cache(predictions.errors_of_body)}
+    return log, analysis, notes, SimpleNamespace(joint=predictions.joint, kept=predictions.kept, **made)
 
 
 def robot_toml(generator):

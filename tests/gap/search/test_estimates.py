@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.channel_result import InParts, drifted, estimate_parameters, in_equal_parts, in_logs, in_parts
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
-from tests.gap.synthetic import GEOMETRY, body_on, line_of, vector_of, wheels_on
+from tests.gap.synthetic import GEOMETRY, body_on, line_of, poses_of, vector_of, wheels_on
 
 
 @pytest.mark.parametrize(("begins_s", "drives"), [((0.0,), 2.0), ((0.0, 30.0, 60.0), 4.0)])
@@ -71,11 +70,7 @@ def turned_sensor(commands):
     And how far its centre of turning is found from where it is (m).
     """
     line = line_of(np.repeat(np.array(commands, dtype=float), 6000 // len(commands), axis=0))
-    still = np.zeros((line.pose.t_s.size, 3))
-    poses = still.copy()
-    read_angles(body_on(line, still).track(vector_of()), line.pose.node, line.pose.fraction, poses)
-    poses += np.random.default_rng(3).standard_normal(poses.shape) * (0.004, 0.004, 0.006) + (0.0, 0.0, 0.02)
-    channel = body_on(line, poses)
+    channel = body_on(line, np.add(poses_of(line, vector_of(), seed=3), (0.0, 0.0, 0.02)))
     best = fit(channel, channel.neutral, channel.free)
     found = SimpleNamespace(reported=best, names=(), selector=SimpleNamespace(channel=channel))
     return found, best.vector[2] - GEOMETRY[2]

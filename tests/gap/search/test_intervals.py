@@ -9,7 +9,6 @@ import pytest
 from scipy.signal import lfilter
 
 from disco_hw.gap.data import WHEEL
-from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit, in_motion
@@ -24,7 +23,7 @@ from disco_hw.gap.search.channel_result import (
     in_logs,
 )
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, body_channel, body_on, line_of, searched, vector_of, wheels_on
+from tests.gap.synthetic import DRIVE, body_channel, body_on, line_of, poses_of, searched, vector_of, wheels_on
 
 
 def estimated(channel, names=("turn_slip",)):
@@ -115,11 +114,9 @@ def of_two_logs(channel):
 
 
 def test_halves_that_disagree_widen_the_interval_to_hold_both():
-    names = ("turn_slip",)
     same, drifting = changing(0.08), changing(0.16)
-    found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
-    result = searched(drifting, names)
-    early, late = in_equal_parts(result, 2)["turn_slip.k_s"].values
+    found = [estimated(one).by_name["turn_slip.k_s"] for one in (same, drifting)]
+    early, late = in_equal_parts(searched(drifting, ("turn_slip",)), 2)["turn_slip.k_s"].values
     assert (early, late) == pytest.approx((0.08, 0.16), abs=0.03)
     assert found[1].low < early < late < found[1].high
     assert found[0].deviation < 0.3 * found[1].deviation
@@ -149,16 +146,12 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     """On a circle a longer axle is as good as slip."""
     rich = 2 * DRIVE
     line = line_of(np.repeat(np.array([(3, 5)] * len(rich) + list(rich), dtype=float), 200, axis=0))
-    plain, truth = body_on(line, line.pose_values), vector_of(turn_slip=0.08)
-    poses = np.empty((line.pose.t_s.size, 3))
-    noise = np.random.default_rng(4).standard_normal(poses.shape) * (0.004, 0.004, 0.006)
-    read_angles(plain.track(truth), line.pose.node, line.pose.fraction, poses)
-    channel = body_on(line, poses + noise)
+    channel = body_on(line, poses_of(line, vector_of(turn_slip=0.08), seed=4))
     result = searched(channel, ("turn_slip",))
     found = in_equal_parts(result, 2)
     assert "turn_slip.k_s" not in found
     assert "axial_distance_m" not in found
-    assert found["x_icr_m"].values == pytest.approx((GEOMETRY[2], GEOMETRY[2]), abs=0.005)
+    assert found["x_icr_m"].values == pytest.approx([vector_of()[2]] * 2, abs=0.005)
     # Of three logs, of which the first is such a circle, the two others speak.
     quarter_s = 0.25 * channel.drive.duration_s
     three = replace(channel, drive=replace(channel.drive, log_begins_s=(0.0, 2.0 * quarter_s, 3.0 * quarter_s)))
@@ -168,14 +161,12 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
 
 
 def test_each_of_several_logs_speaks_for_itself():
-    channel = of_two_logs(changing(0.16))
-    result = searched(channel, ("turn_slip",))
+    result = searched(of_two_logs(changing(0.16)), ("turn_slip",))
     found = in_logs(result)
     assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.16), abs=0.03)
     assert found["turn_slip.k_s"].apart(0, 1) > 3.0
     assert abs(found["wheel_radius_m"].apart(0, 1)) < 3.0
-    one = changing(0.16)
-    assert in_logs(searched(one, ("turn_slip",))) == {}
+    assert in_logs(searched(changing(0.16), ("turn_slip",))) == {}
     assert in_equal_parts(result, 3)["turn_slip.k_s"].values.size == 3
 
 
@@ -244,6 +235,9 @@ def test_what_halves_surely_differ_by_goes_on_and_what_quarters_differ_by_comes_
     assert drifted(found) == {"motor_lag.tau_s": pytest.approx(expected)}
 
 
+UNEVEN = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
+
+
 def wheels_that_lose(lost_on_the_spot):
     """What is found of wheels that lose 0.5 rad/s on straights and arcs, and so much on each spot; 1.5 % of noise."""
     rng = np.random.default_rng(12)
@@ -257,9 +251,7 @@ def wheels_that_lose(lost_on_the_spot):
     error = lfilter([(1.0 - keep**2) ** 0.5], [1.0, -keep], rng.standard_normal(turned.shape), axis=0)
     speed = turned * (1.0 + 0.015 * error) + 0.02 * rng.standard_normal(turned.shape)
     line = replace(line_of(speed), command_rad_s=np.repeat(commands, 50, axis=0))
-    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
-    channel = wheels_on(line, noise)
-    return searched(channel, ("deadband",))
+    return searched(wheels_on(line, UNEVEN), ("deadband",))
 
 
 def wheels_that_stick(thresholds):
@@ -269,9 +261,7 @@ def wheels_that_stick(thresholds):
     command = np.tile(ramp, thresholds.size)[:, None] * (1.0, 1.0)
     turned = np.where(command > np.repeat(thresholds, ramp.size)[:, None], command, 0.0)
     line = replace(line_of(turned + 0.02 * rng.standard_normal(turned.shape)), command_rad_s=command)
-    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
-    channel = wheels_on(line, noise)
-    return searched(channel, ("stiction",))
+    return searched(wheels_on(line, UNEVEN), ("stiction",))
 
 
 @pytest.mark.parametrize("scatters", [False, True])

@@ -34,11 +34,8 @@ def selector(given=(), start=None, moves_m=0.001, **effects):
     return selector_of(channel, replace(LIMITS, moves_m=moves_m), given=given, start=start)
 
 
-def test_nothing_is_selected_where_nothing_is_missing():
-    assert selector().select() == ()
-
-
 def test_exactly_what_is_missing_is_selected():
+    assert selector().select() == ()
     found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.02)
     names = found.select()
     assert set(names) == {"turn_slip", "wheel_radius_asymmetry"}
@@ -47,37 +44,27 @@ def test_exactly_what_is_missing_is_selected():
     assert vector[BODY.place["wheel_radius_asymmetry.ratio"]] == pytest.approx(0.02, rel=0.1)
 
 
-def test_what_is_not_needed_goes_again():
+def test_what_is_not_needed_goes_again_and_a_stand_in_is_swapped_for_what_it_stood_in_for():
     found = selector(turn_slip=0.08)
     assert found.select(("side_slip", "turn_slip", "slope")) == ("turn_slip",)
-
-
-def test_a_stand_in_is_swapped_for_what_it_stood_in_for():
-    found = selector(turn_slip=0.08)
     assert found.swapped(("surface_change",)) == ("turn_slip",)
-
-
-def test_among_some_only_those_are_dropped_or_swapped():
-    found = selector(turn_slip=0.08)
+    # Among some only those.
     assert found.needed(("side_slip", "turn_slip", "slope"), ("slope", "turn_slip")) == ("side_slip", "turn_slip")
     assert found.swapped(("surface_change",), ("slope", "turn_slip")) == ("surface_change",)
     assert found.swapped(("surface_change",), ("surface_change", "slope")) == ("surface_change",)
     assert found.swapped(("surface_change",), ("surface_change", "slope", "turn_slip")) == ("turn_slip",)
 
 
-def wheels_slow(tau_s):
-    """A search of wheels that follow steps of their commands as a lag."""
-    commands = np.repeat(np.random.default_rng(7).choice([-4.0, -2.0, 0.0, 3.0, 5.0], 60), 100)
-    keep = np.exp(-GRID_STEP_S / tau_s)
-    followed = lfilter([1.0 - keep], [1.0, -keep], commands)
-    line = line_of(np.repeat(followed[:, None], 2, axis=1))
-    line = replace(line, command_rad_s=np.repeat(commands[:, None], 2, axis=1))
-    channel = wheels_on(line)
-    return selector_of(channel, replace(LIMITS, moves_m=0.005))
+def wheels_that_follow(commands, followed, moves_m=0.001):
+    """A search of wheels of which both were commanded alike (M,) and turned alike."""
+    both, turned = (np.repeat(each[:, None], 2, axis=1) for each in (commands, followed))
+    return selector_of(wheels_on(replace(line_of(turned), command_rad_s=both)), replace(LIMITS, moves_m=moves_m))
 
 
 def test_a_short_lag_with_a_delay_beside_it_is_not_taken_for_the_delay():
-    found = wheels_slow(0.03)
+    commands = np.repeat(np.random.default_rng(7).choice([-4.0, -2.0, 0.0, 3.0, 5.0], 60), 100)
+    keep = np.exp(-GRID_STEP_S / 0.03)
+    found = wheels_that_follow(commands, lfilter([1.0 - keep], [1.0, -keep], commands), 0.005)
     both = ("motor_lag", "command_delay")
     # The lag surely is there, however little it moves beside a delay; a delay is not.
     assert found.acceptable(("command_delay",), both)
@@ -97,8 +84,7 @@ def test_what_only_turning_loses_is_told_from_what_every_wheel_loses(hidden):
     turned = np.column_stack([mean - less(half), mean + less(half)])
     followed = turned if hidden == "turning_load" else less(commands)
     line = replace(line_of(followed + 0.05 * rng.standard_normal(commands.shape)), command_rad_s=commands)
-    channel = wheels_on(line)
-    found = selector_of(channel)
+    found = selector_of(wheels_on(line))
     # Starts and stops within a cell of the grid look like a short delay.
     assert [name for name in found.select() if name not in DELAY_NAMES] == [hidden]
     column = REGISTRY[hidden].columns[0]
@@ -152,16 +138,10 @@ def test_a_change_is_found_when_it_happens():
     assert found.fit(names).vector[BODY.place["surface_change.time_s"]] == pytest.approx(40.0, abs=2.0)
 
 
-def wheels_late(commands_rad_s, late_cells=20):
-    """A search of wheels that follow these commands (M,) 0.2 s late."""
-    commands = np.repeat(commands_rad_s[:, None], 2, axis=1)
-    followed = np.concatenate([np.repeat(commands[:1], late_cells, axis=0), commands[:-late_cells]])
-    line = replace(line_of(followed), command_rad_s=commands)
-    channel = wheels_on(line)
-    return selector_of(channel)
-
-
 def test_a_slow_drive_cannot_tell_lag_from_delay_and_says_so():
+    def wheels_late(commands):
+        return wheels_that_follow(commands, np.concatenate([np.full(20, commands[0]), commands[:-20]]))
+
     t_s = 0.01 * np.arange(6000)
     slow = wheels_late(3.0 + 2.0 * np.sin(2.0 * np.pi * t_s / 20.0))
     assert "motor_lag" in slow.rivals(("command_delay",), "command_delay")
@@ -254,7 +234,7 @@ def test_noise_that_wanders_is_named_by_gain_alone_and_not_by_the_rule():
     assert found.select() == ()
 
 
-def test_candidates_come_in_order_of_what_they_promise():
+def test_candidates_come_in_order_of_what_they_promise_and_the_first_of_them_is_tried_first():
     found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.004)
     ranked = found.ranked(())
     assert len(ranked) > 2
@@ -265,10 +245,6 @@ def test_candidates_come_in_order_of_what_they_promise():
     others = set(candidates_of(BODY)) - set(ranked)
     assert all(found.promise((), name) <= 0.0 for name in others)
     assert "turn_slip" not in found.ranked(("turn_slip",))
-
-
-def test_the_first_that_is_taken_is_the_most_promising():
-    found = selector(turn_slip=0.08, wheel_radius_asymmetry=0.004)
     tried = []
     found.acceptable = lambda smaller, larger: tried.append(larger[-1])
     assert found.select() == ()
@@ -330,18 +306,21 @@ class Stuck(Selector):
         return []
 
 
+def of_kind(kind, **effects):
+    """A search of some kind on a drive of a robot that has these effects."""
+    channel, _ = body_channel(**effects)
+    return kind(channel, body_moves(channel), LIMITS)
+
+
 def test_a_search_that_begins_with_a_stand_in_swaps_it_even_where_nothing_gains_on_top_of_it():
-    channel, _ = body_channel(turn_slip=0.08)
-    assert Stuck(channel, body_moves(channel), LIMITS).select(("turn_asymmetry",)) == ("turn_slip",)
+    assert of_kind(Stuck, turn_slip=0.08).select(("turn_asymmetry",)) == ("turn_slip",)
 
 
 def test_a_search_that_comes_back_to_where_it_was_ends_with_the_best_set_on_its_way():
-    channel, _ = body_channel(turn_slip=0.08, side_slip=0.1)
-    circling = Circling(channel, body_moves(channel), LIMITS)
-    assert circling.select(("turn_slip",)) == ("side_slip", "turn_slip")
+    both = of_kind(Circling, turn_slip=0.08, side_slip=0.1)
+    assert both.select(("turn_slip",)) == ("side_slip", "turn_slip")
     # One that is next to nothing worth is not the best, as its price is paid.
-    channel, _ = body_channel(turn_slip=0.08)
-    assert Circling(channel, body_moves(channel), LIMITS).select(("turn_slip",)) == ("turn_slip",)
+    assert of_kind(Circling, turn_slip=0.08).select(("turn_slip",)) == ("turn_slip",)
 
 
 def test_the_price_of_an_effect_is_that_of_all_its_parameters():
