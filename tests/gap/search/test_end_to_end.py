@@ -40,13 +40,6 @@ def test_the_geometry_that_predicts_is_found_from_one_that_does_not():
     assert (np.abs(joint.vectors[0][:3] - GEOMETRY) < 4.0 * deviations).all()
 
 
-def test_what_is_known_well_before_stays():
-    channel, _ = body_channel()
-    start = off(channel)
-    joint = predictions(channel).fit(geometry_of(start, information=1e12))
-    assert joint.vectors[0][:3] == pytest.approx(start[:3], rel=1e-3)
-
-
 def test_the_fold_that_is_left_out_is_not_looked_at():
     channel, line = body_channel()
     spoilt = line.pose_values.copy()

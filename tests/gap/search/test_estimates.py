@@ -142,7 +142,9 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     # Halves that lie 3.1 and 2.9 of their deviations apart.
     sure, unsure = (InParts(np.array([0.0, of * 2.0**0.5]), np.ones(2)) for of in (-3.1, 2.9))
     quarters = InParts(np.array([0.0, 4.0, 0.0, 4.0]), np.ones(4))
-    shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: {"both": quarters, "short": quarters}}
+    alike = InParts(np.array([0.0, 0.5]), np.full(2, 0.1))
+    shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: dict.fromkeys(("both", "short"), quarters)}
+    shown[4]["little"] = alike
     monkeypatch.setattr(channel_result, "in_equal_parts", lambda found, count: shown[count])
     logs: dict[str, InParts] = {}
     monkeypatch.setattr(channel_result, "in_logs", lambda found: logs)
@@ -151,14 +153,14 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     told = drifted(of_blocks(np.arange(12)))
     assert told == {
         "sure": pytest.approx(4.0 * of_sure), "unsure": pytest.approx(of_unsure), "both": pytest.approx(4.0 * of_sure),
-        "short": pytest.approx((16.0 - 3.0) / 3.0),
+        "short": pytest.approx((16.0 - 3.0) / 3.0), "little": pytest.approx(0.125 - 0.01),
     }  # fmt: skip
     # What goes on from drive to drive is seen in halves alone.
     shown[2] = {"short": unsure}
     assert drifted(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
     # And by what logs differ, where that is more.
-    logs |= {"short": quarters, "new": quarters, "little": InParts(np.array([0.0, 0.5]), np.full(2, 0.1))}
-    most = {"short": of_unsure, "new": 13.0 / 3.0, "little": 0.125 - 0.01}
+    logs |= {"short": quarters, "new": quarters, "slight": alike}
+    most = {"short": of_unsure, "new": 13.0 / 3.0, "slight": 0.125 - 0.01}
     told = drifted(of_blocks(np.arange(12)))
     assert {name: told[name] for name in most} == pytest.approx(most)
     logs["short"] = InParts(np.array([0.0, 5.0]), np.ones(2))

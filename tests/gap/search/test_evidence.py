@@ -50,16 +50,6 @@ def test_white_noise_speaks_for_nothing_and_a_real_slope_for_itself():
     assert real.held_out == pytest.approx(real.gain, rel=0.2)
 
 
-def test_noise_that_comes_in_blocks_inflates_the_variance():
-    rng = np.random.default_rng(1)
-    x = np.ones((N, 1))
-    white = rng.standard_normal(N)
-    sound = inflation(linear_fit(x, white), channel(), (0,))
-    shaken = inflation(linear_fit(x, white + wandering(rng)), channel(), (0,))
-    assert sound < 3.0
-    assert shaken > 20.0
-
-
 @pytest.mark.parametrize("size", [1e-90, 0.0])
 def test_what_is_told_of_next_to_nothing_is_judged_without_a_fault(size):
     white = np.random.default_rng(5).standard_normal(N)
@@ -191,11 +181,6 @@ def test_of_few_blocks_too_intervals_hold_nearly_as_often_as_they_say(blocks):
     assert 0.86 < np.mean(held) < 0.99
 
 
-def test_without_blocks_enough_the_model_of_the_noise_is_believed():
-    found = linear_fit(np.ones((N, 1)), wandering(np.random.default_rng(10)) + 1.0)
-    assert inflation(found, channel(0.0, block=np.zeros(N, dtype=int)), (0,)) == 1.0
-
-
 def longest(lengths, fewest=5, blocks=N // EACH):
     """The inflation by blocks of these lengths, of noise that wanders, of what the first so many blocks show."""
     x = np.where(np.arange(N) < blocks * EACH, 1.0, 0.0)[:, None]
@@ -268,21 +253,6 @@ def test_what_repeats_is_there_without_a_block_and_in_a_third_place_says_more_th
     # A log of a single residual counts as one of two.
     assert not EffectEvidence(90.0, 80.0, 70.0, 0.34, 9.0, 99.0).holds_without_two_best(1)
     assert EffectEvidence(90.0, 80.0, 70.0, 0.35, 9.0, 99.0).holds_without_two_best(1)
-
-
-def test_blocks_that_say_nothing_of_a_parameter_hide_no_scatter_of_the_others():
-    x = np.ones((N, 1))
-    # Of every length that is looked at, one block knows nothing.
-    x[: 9 * EACH] = 0.0
-    assert inflation(linear_fit(x, wandering(np.random.default_rng(13))), channel(), (0,)) > 5.0
-
-
-def test_scatter_counts_as_long_as_more_than_one_block_speaks():
-    x = np.full((N, 1), 0.0447)
-    x[:EACH] = 1.0
-    told = np.array([(x[b == BLOCK] ** 2).sum() for b in range(N // EACH)])
-    assert 1.2 < told.sum() ** 2 / (told**2).sum() < 1.3
-    assert inflation(linear_fit(x, wandering(np.random.default_rng(14))), channel(0.0), (0,)) > 5.0
 
 
 def test_evidence_is_divided_by_the_scatter_of_what_is_added_and_of_nothing_else():

@@ -17,7 +17,6 @@ from disco_hw.gap.search.channel_result import (
     InParts,
     ParameterEstimate,
     deviations_of,
-    drifted,
     estimate_parameters,
     in_equal_parts,
     in_logs,
@@ -50,15 +49,6 @@ def test_intervals_hold_what_another_drive_gives(twelve):
     for here, there in permutations(twelve, 2):
         held += [here[name].low <= there[name].value <= here[name].high for name in TRUTH]
     assert 0.95 <= np.mean(held) <= 0.995
-
-
-def test_an_estimate_tells_its_standard_deviation_and_the_joint_one():
-    found = estimated(body_channel(turn_slip=0.08)[0])
-    place = found.fitted.index("turn_slip.k_s")
-    assert found.by_name["turn_slip.k_s"].deviation == pytest.approx(found.covariance[place, place] ** 0.5)
-    # More slip and a longer axle both take from turning: what is known is their sum.
-    axle = found.fitted.index("axial_distance_m")
-    assert found.covariance[place, axle] < 0.0
 
 
 def test_noise_larger_than_thought_widens_the_interval():
@@ -212,27 +202,6 @@ def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
         assert {each.name for each in found if each.differs} - {"axial_distance_m"} == differs
         for each in found:
             assert all(low < value < high for value, low, high in each.values)
-
-
-@pytest.mark.parametrize(
-    ("halves", "quarters", "noise", "expected"),
-    [(0.3, 0.5, 1e-6, 1.2), (0.1, 0.5, 1e-6, 0.5), (0.3, 0.1, 0.2, 0.26), (0.3, 0.1, 0.15, 4.0 * 0.2775)],
-)
-def test_what_halves_surely_differ_by_goes_on_and_what_quarters_differ_by_comes_and_goes(
-    monkeypatch, halves, quarters, noise, expected
-):
-    spread = {2: halves, 4: quarters}
-
-    def in_parts(found, parts):
-        count = np.unique(parts).size
-        assert np.bincount(parts).tolist() == [12 // count] * count
-        return {"motor_lag.tau_s": InParts(np.array([0.0, (2.0 * spread[count]) ** 0.5]), np.full(2, noise))}
-
-    monkeypatch.setitem(drifted.__globals__, "in_parts", in_parts)
-    monkeypatch.setitem(drifted.__globals__, "in_logs", lambda found: {})
-    channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
-    found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
-    assert drifted(found) == {"motor_lag.tau_s": pytest.approx(expected)}
 
 
 UNEVEN = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
