@@ -384,6 +384,7 @@ def test_a_regime_is_told_by_mean_speed_and_mean_yaw_rate(v_m_s, omega_rad_s, to
     channel = moving(v_m_s, omega_rad_s)
     assert regimes_driven(channel, np.array([0, 100, 300]), 200) == [told] * 3
     assert regimes_driven(channel, np.array([0, 100]), 20) == [told] * 2
+    assert regimes_driven(channel, np.array([], dtype=int), 20) == []
 
 
 @pytest.mark.parametrize(
