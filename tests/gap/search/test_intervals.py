@@ -51,14 +51,6 @@ def test_intervals_hold_what_another_drive_gives(twelve):
     assert 0.95 <= np.mean(held) <= 0.995
 
 
-def test_noise_larger_than_thought_widens_the_interval():
-    channel, line = body_channel(turn_slip=0.08)
-    wander = 0.05 * np.sin(2.0 * np.pi * channel.samples.t_s[:, None] / (7.0, 11.0, 17.0))
-    shaken = body_on(line, line.pose_values + wander)
-    found = [estimated(one).by_name["turn_slip.k_s"] for one in (channel, shaken)]
-    assert found[1].deviation > 2.0 * found[0].deviation
-
-
 def test_the_time_of_a_change_has_an_interval_around_it():
     channel, _ = body_channel()
     vector = vector_of(surface_change__track=0.12, surface_change__time_s=35.0)
