@@ -163,16 +163,14 @@ def built_up(commands, **values):
     return 0.5 * (wheels[:, 1] - wheels[:, 0]), wheels.mean(axis=1)
 
 
-def test_turning_builds_up_slowly_and_falls_at_once():
+def test_turning_builds_up_slowly_from_what_is_there_at_once_and_falls_at_once():
     half, mean = built_up([[-1.0, 3.0]] * 6 + [[1.0, 1.0]] * 2 + [[3.0, -1.0]] * 3)
     assert half == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0, 0.0, -0.1, -0.2, -0.3])
     assert mean == pytest.approx([1.0] * 11)
     # Turning the other way begins from none.
     half, _ = built_up([[-1.0, 1.0]] * 5 + [[1.0, -1.0]] * 2)
     assert half[4:] == pytest.approx([0.5, -0.1, -0.2])
-
-
-def test_turning_is_there_at_once_up_to_what_it_says():
+    # Up to this it is there at once.
     half, _ = built_up([[-2.0, 2.0]] * 3, at_once_rad_s=0.7)
     assert half == pytest.approx([0.8, 0.9, 1.0])
     half, _ = built_up([[-0.5, 0.5]] * 3, at_once_rad_s=0.7)
@@ -182,7 +180,6 @@ def test_turning_is_there_at_once_up_to_what_it_says():
 def test_motors_that_give_all_to_a_turn_leave_the_mean_behind_by_what_the_turn_lacks():
     half, mean = built_up([[-0.5, 2.5]] * 8, shared=1.0)
     assert half == pytest.approx(0.1 * np.arange(1, 9))
-
     assert mean == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
 
 

@@ -85,14 +85,11 @@ def gains_that_show(asymmetry, left_deviation=0.002, right_deviation=0.006):
     )
 
 
-def test_an_encoder_is_possible_within_three_deviations_of_what_body_and_wheels_say():
+def test_an_encoder_is_possible_within_three_deviations_and_the_cause_where_that_says_three_nats_more_than_none():
     # Of the body 3 per mil, of the gains 4 on the mean: 5 together.
     for sigmas, possible in ((2.9, True), (3.1, False), (-2.9, True), (-3.1, False)):
         value = 0.05 + 0.005 * sigmas
         assert one_encoder(gains_that_show(0.05), (value, 0.003), SETTINGS) == (possible, possible)
-
-
-def test_it_is_the_cause_where_it_says_so_by_three_nats_against_none():
     for value, cause in ((0.0134, True), (0.0130, False)):
         # One deviation of 5 per mil away from what it would be.
         assert one_encoder(gains_that_show(value - 0.005), (value, 0.003), SETTINGS) == (True, cause)

@@ -233,9 +233,7 @@ def test_errors_are_root_mean_squares_by_regime_and_by_stretch():
     # Of two stretches either may be drawn twice.
     assert told.position_ci == pytest.approx((np.sqrt(2.0), np.sqrt(13.0)))
     assert told.yaw_ci == pytest.approx((np.sqrt(0.02), np.sqrt(0.025)))
-
-
-def test_of_no_predictions_nothing_is_told():
+    # Of no predictions nothing is told.
     nothing = np.empty((0, 3))
     told = summarise(nothing, np.empty(0), starts_at([], nothing, nothing), DEFAULT_SETTINGS.prediction)
     assert np.isnan([told.position_m, *told.position_ci, told.yaw_rad, *told.yaw_ci, told.wheel_rad_s]).all()
