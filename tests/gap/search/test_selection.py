@@ -10,8 +10,7 @@ from scipy.signal import lfilter
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.search.evidence import EffectEvidence
-from disco_hw.gap.search.least_squares import fit
-from disco_hw.gap.search.richest_model import CANDIDATES, DELAY_NAMES, candidates_of, indices
+from disco_hw.gap.search.richest_model import DELAY_NAMES, candidates_of
 from disco_hw.gap.search.selection import Selector, Thresholds, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import (
@@ -225,35 +224,6 @@ def test_candidates_come_in_order_of_what_they_promise_and_the_first_of_them_is_
     assert tried[0] == "turn_slip"
 
 
-def test_a_set_is_fitted_again_from_the_larger_one_that_found_better():
-    found = selector(turn_slip=0.08, side_slip=0.1)
-    both, rest = ("turn_slip", "side_slip"), ("side_slip",)
-    good = found.fit(rest)
-    poor = replace(good, cost=good.cost + 50.0, loose=False)
-    found.fits[frozenset(rest)] = poor
-    found.evidence(rest, both)
-    found.evidence((), ("turn_slip",))
-    found._refit_without(both, "turn_slip", rest)
-    assert found.fit(rest).cost == pytest.approx(good.cost, abs=1.0)
-    # What was proved with the worse fit is judged anew, what had nothing to do with it is kept.
-    assert (frozenset(rest), frozenset(both)) not in found.proofs
-    assert (frozenset(), frozenset({"turn_slip"})) in found.proofs
-
-
-def test_a_fit_that_is_as_good_is_kept_and_so_is_that_of_what_is_given():
-    found = selector(turn_slip=0.08)
-    both, rest = ("turn_slip", "side_slip"), ("turn_slip",)
-    before = found.fit(rest)
-    found._refit_without(both, "side_slip", rest)
-    assert found.fit(rest) is before
-    start = found.channel.neutral
-    known = selector(given=("turn_slip",), start=start, turn_slip=0.08)
-    worse = replace(known.fit(rest), cost=known.fit(rest).cost + 50.0)
-    known.fits[frozenset(rest)] = worse
-    known._refit_without(both, "side_slip", rest)
-    assert known.fit(rest) is worse
-
-
 class Circling(Selector):
     """A search that swaps and drops in a circle: none, the first, the second, both, the first; both fit best."""
 
@@ -340,15 +310,3 @@ def test_what_is_proved_rests_on_exact_fits_and_what_competes_on_loose_ones():
     assert found.exact(("turn_slip",)) is exact
     assert abs(exact.cost - loose.cost) < DEFAULT_SETTINGS.fit.enough_nats
     assert exact.vector == pytest.approx(loose.vector, rel=1e-3, abs=1e-5)
-
-
-def test_a_scanned_entry_is_fitted_at_a_neighbouring_value_as_from_anywhere():
-    found = selector(surface_change=0.1)
-    (candidate,) = (each for name, each in CANDIDATES.items() if name == "surface_change")
-    active = indices(found.channel, ("surface_change",))
-    near = found._at(found.fit(()), active, candidate, 30.0)
-    begun = found._at(near, active, candidate, 32.0)
-    vector = near.vector.copy()
-    vector[BODY.place["surface_change.time_s"]] = 32.0
-    assert begun.vector[BODY.place["surface_change.time_s"]] == 32.0
-    assert begun.cost == pytest.approx(fit(found.channel, vector, active).cost, abs=0.02)
