@@ -76,8 +76,7 @@ def test_armed_it_goes_on_hearing_the_robots_state_or_stops(missing):
     bench = create_bench()
     ids = [CODEC.can_id(name) for name in missing]
     bench.drive(1.0, (3.0, 3.0))
-    drain = bench.robot.drain
-    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id not in ids]
+    drain, bench.robot.drain = bench.robot.drain, lambda: [frame for frame in drain() if frame.can_id not in ids]
     bench.run(0.35)
     assert bench.driver.state is DriverState.ARMED
     bench.run(0.55)

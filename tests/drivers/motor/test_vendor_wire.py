@@ -11,7 +11,7 @@ import pytest
 from drivers.types import DriverState, Request
 from sim.can_protocol import CanFrame
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL, VENDORS
 
 COASTING_S = 1.0
 PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
@@ -134,11 +134,10 @@ def test_no_frame_of_a_scripted_day_moves_by_itself_calibrates_or_writes_what_st
     ],
 )  # fmt: skip
 def test_what_no_driver_may_send_would_be_noticed(label, frames):
-    (vendor,) = [one for one in VENDORS if one.label == label]
     for text in frames:
         can_id, data = text.rstrip("x").split(" ")
         frame = CanFrame(int(can_id, 16), bytes.fromhex(data), text.endswith("x"))
-        assert vendor.is_forbidden(frame), text
+        assert BY_LABEL[label].is_forbidden(frame), text
 
 
 @pytest.mark.parametrize("vendor", MARKED_VENDORS, ids=str)

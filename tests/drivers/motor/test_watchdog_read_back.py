@@ -9,13 +9,10 @@ from disco_hw.runtime.preflight import Level, check_watchdog
 from drivers.motor.vesc_codec import timeout
 from drivers.types import DriverState
 from tests.drivers.motor.bench import IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
-
-
-def readable_odrive():
-    return replace(BY_LABEL["odrive-0.6"], changes="watchdog_endpoints = [220, 221]\n")
+ODRIVE = replace(BY_LABEL["odrive-0.6"], changes="watchdog_endpoints = [220, 221]\n")
+VESC = BY_LABEL["vesc"]
 
 
 def vescs(bench):
@@ -31,16 +28,16 @@ def vescs(bench):
     ],
 )
 def test_a_vesc_whose_timeout_is_another_is_refused(field, value, expected_detail):
-    bench = BY_LABEL["vesc"].bench()
+    bench = VESC.bench()
     setattr(vescs(bench)[1], field, value)
     bench.run_until(DriverState.REFUSED)
     assert expected_detail in bench.driver.detail
     assert bench.driver.identity is bench.driver.limits is None
-    assert not [frame for frame in bench.robot.received if BY_LABEL["vesc"].is_motion(frame)]
+    assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
 
 
 def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():
-    bench = BY_LABEL["vesc"].bench()
+    bench = VESC.bench()
     for vesc in vescs(bench):
         obey = vesc._obey
         vesc._obey = lambda payload, behind, obey=obey: (None, []) if payload[:1] == b"\x11" else obey(payload, behind)
@@ -61,14 +58,14 @@ def test_settings_of_another_layout_or_controller_are_not_used(payload):
     ],
 )
 def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, expected_detail):
-    bench = readable_odrive().bench()
+    bench = ODRIVE.bench()
     bench.robot.controller.boards[1].parameters[number] = value
     bench.run_until(DriverState.REFUSED)
     assert expected_detail in bench.driver.detail
 
 
 def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
-    bench = readable_odrive().bench()
+    bench = ODRIVE.bench()
     bench.robot.controller.boards[0].parameters.clear()
     bench.run_until(DriverState.REFUSED)
     assert "node 3 does not report its watchdog; correct link.watchdog_endpoints" in bench.driver.detail
@@ -78,8 +75,8 @@ def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
     ("vendor", "level", "expected_text"),
     [
         (BY_LABEL["odrive-0.5"], Level.WARNING, "could not be read back"),
-        (readable_odrive(), Level.OK, "reported by the controller"),
-        (BY_LABEL["vesc"], Level.OK, "reported by the controller"),
+        (ODRIVE, Level.OK, "reported by the controller"),
+        (VESC, Level.OK, "reported by the controller"),
         (BY_LABEL["agilex"], Level.OK, "cannot be set otherwise"),
         (BY_LABEL["roboclaw"], Level.OK, "reported by the controller"),
     ],

@@ -197,3 +197,4 @@ VENDORS = (
         lose_left=lose_left_ros2_base, is_motion=is_ros2_base_motion, is_forbidden=is_ros2_base_forbidden,
     ),
 )  # fmt: skip
+BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
