@@ -3,7 +3,6 @@
 import queue
 import threading
 import time
-from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -21,18 +20,17 @@ from drivers.transport.reconnecting import (
     next_delay_s,
 )
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
+from tests.drivers.transport.links import opened
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
 POLICY = BackoffPolicy(first_s=0.1, longest_s=1.0, steady_s=5.0)
 
 
 def test_delays_double_up_to_the_longest():
-    delays = []
-    delay = None
+    delays = [None]
     for _ in range(6):
-        delay = next_delay_s(POLICY, delay, up_for_s=0.0)
-        delays.append(delay)
-    assert delays == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
+        delays.append(next_delay_s(POLICY, delays[-1], up_for_s=0.0))
+    assert delays[1:] == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
 
 
 def test_a_steady_link_starts_afresh_and_a_flapping_one_does_not():
@@ -66,19 +64,22 @@ def frame(can_id, number=0, deadline_ns=100):
 
 
 def drain(queue):
-    sent = []
-    while (outgoing := queue.pop()) is not None:
-        sent.append(outgoing)
-    return sent
+    return list(iter(queue.pop, None))
 
 
-@given(st.lists(st.integers(0, 0x7FF), max_size=40))
-def test_lowest_identifier_first_and_equal_ones_as_they_came(can_ids):
+def pairs(frames):
+    """Identifier and number of each frame."""
+    return [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in frames]
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x7FF), st.booleans()), max_size=40))
+def test_what_has_not_expired_is_sent_lowest_identifier_first_and_equal_ones_as_they_came(frames):
     queue = TransmitQueue(64)
-    for number, can_id in enumerate(can_ids):
-        assert queue.push(frame(can_id, number)) is None
-    sent = [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in drain(queue)]
-    assert sent == sorted((can_id, number) for number, can_id in enumerate(can_ids))
+    for number, (can_id, is_expired) in enumerate(frames):
+        assert queue.push(frame(can_id, number, deadline_ns=10 if is_expired else 100)) is None
+    assert queue.expire(50) == sum(is_expired for _, is_expired in frames)
+    kept = [(can_id, number) for number, (can_id, is_expired) in enumerate(frames) if not is_expired]
+    assert pairs(drain(queue)) == sorted(kept)
 
 
 def test_frames_of_one_rank_keep_their_order_and_a_lower_rank_goes_first():
@@ -96,16 +97,6 @@ def test_a_frame_never_outlives_its_deadline():
     assert queue.expire(10) == 0
     assert queue.expire(11) == 1
     assert queue.pop().frame.can_id == 2
-
-
-@given(st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=40))
-def test_what_has_not_expired_keeps_its_order(frames):
-    queue = TransmitQueue(64)
-    for number, (can_id, is_expired) in enumerate(frames):
-        queue.push(frame(can_id, number, deadline_ns=10 if is_expired else 100))
-    assert queue.expire(50) == sum(is_expired for _, is_expired in frames)
-    sent = [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in drain(queue)]
-    assert sent == sorted((can_id, number) for number, (can_id, is_expired) in enumerate(frames) if not is_expired)
 
 
 def test_full_queue_refuses_the_least_urgent_frame():
@@ -273,7 +264,7 @@ def test_an_error_while_sending_makes_the_link_anew(transport, medium):
 
 @pytest.mark.parametrize("way", ["read", "write"])
 def test_the_loss_is_reported_in_the_mediums_words(medium, way):
-    with closing(ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=5.0))) as transport:
+    with opened(medium, BackoffPolicy(first_s=5.0)) as transport:
         up(transport)
         if way == "read":
             medium.incoming.put(OSError("unplugged"))
@@ -292,13 +283,10 @@ def test_a_device_that_is_absent_or_flaps_is_tried_less_and_less_often(medium, f
             medium.incoming.put(OSError("gone at once"))
     else:
         medium.refusals = [OSError("not there")] * 10_000
-    transport = ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=0.01, longest_s=10.0, steady_s=5.0))
     started = time.monotonic()
-    transport.open()
-    wait_until(lambda: medium.attempts >= 5)
-    elapsed_s = time.monotonic() - started
-    transport.close()
-    assert elapsed_s >= 0.01 + 0.02 + 0.04 + 0.08
+    with opened(medium, BackoffPolicy(first_s=0.01, longest_s=10.0, steady_s=5.0)):
+        wait_until(lambda: medium.attempts >= 5)
+        assert time.monotonic() - started >= 0.01 + 0.02 + 0.04 + 0.08
 
 
 def test_an_idle_link_costs_nothing(transport):
@@ -447,11 +435,7 @@ def test_a_link_is_left_open_while_frames_come_and_connected_again_when_none_doe
     medium = ScriptedMedium()
     connections = iter((Answering(medium), Silent(medium)))
     medium.connect = lambda _counters: next(connections)
-    transport = ReconnectingTransport(medium, backoff=FAST, mute_after_s=0.5)
-    transport.open()
-    try:
+    with opened(medium, FAST, mute_after_s=0.5) as transport:
         assert second.wait(10.0)
         assert (reads[0], transport.generation) == (46, 2)
         assert "no frame received for 0.5 s" in transport.last_error
-    finally:
-        transport.close()
