@@ -31,16 +31,18 @@ def robot_toml(folder, link):
     return file
 
 
-def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
-    for name, driver in motor_drivers().items():
-        assert driver.name == name
-        settings = msgspec.convert(tomllib.loads(EXAMPLES[name]), driver.settings)
-        assert create_driver(name, settings).state is DriverState.DISCONNECTED
+@pytest.mark.parametrize("name", motor_drivers())
+def test_every_driver_is_found_and_made_by_its_name_and_robot_toml_may_name_it(tmp_path, name):
+    driver = motor_drivers()[name]
+    assert driver.name == name
+    assert find_driver(name) is driver
+    settings = msgspec.convert(tomllib.loads(EXAMPLES[name]), driver.settings)
+    assert create_driver(name, settings).state is DriverState.DISCONNECTED
+    link = f'driver = "{name}"\nkind = "{driver.kinds[0]}"\n{EXAMPLES[name]}'
+    assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
 
 
-def test_every_driver_is_found_by_its_name_and_none_without_one_is_the_default():
-    for name, driver in motor_drivers().items():
-        assert find_driver(name) is driver
+def test_without_a_name_the_driver_is_the_default():
     assert find_driver(None) is motor_drivers()[DEFAULT]
 
 
@@ -55,14 +57,10 @@ def test_what_needs_one_driver_reads_no_other():
     assert not {"drivers.motor.odrive", "drivers.motor.roboclaw", "drivers.motor.agilex"} & set(names)
 
 
-def test_a_module_beside_the_drivers_is_none():
-    with pytest.raises(UnknownDriverError, match='no driver "wiring"'):
-        find_driver("wiring")
-
-
-def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are():
-    with pytest.raises(UnknownDriverError, match=f'no driver "oddrive"; write one of {", ".join(motor_drivers())}$'):
-        create_driver("oddrive")
+@pytest.mark.parametrize("name", ["oddrive", "wiring"], ids=["no module", "a module beside the drivers"])
+def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are(name):
+    with pytest.raises(UnknownDriverError, match=f'no driver "{name}"; write one of {", ".join(motor_drivers())}$'):
+        create_driver(name)
 
 
 def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
@@ -70,12 +68,6 @@ def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
         load_robot_config(robot_toml(tmp_path, 'driver = "oddrive"'))
     assert "robot.toml: link.driver: there is no driver" in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def test_robot_toml_may_name_each_driver(tmp_path):
-    for name in motor_drivers():
-        link = f'driver = "{name}"\nkind = "{motor_drivers()[name].kinds[0]}"\n{EXAMPLES[name]}'
-        assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
 
 
 @pytest.mark.parametrize(

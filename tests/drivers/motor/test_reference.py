@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from drivers.motor.reference import ESTOP_REPEATS
-from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
+from drivers.motor.reference_protocol import cyclic_frames
+from drivers.types import CyclicFrame, DriverState, Frame, NoSettings, ReceivedFrame, Request, WheelCommand
 from firmware_protocol.status_codes import FAULTS
 from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS
 from tests.drivers.motor.reference_robot import CODEC, CONFIG, ReferenceRobot, create_bench, create_driver
@@ -378,3 +379,12 @@ def test_released_its_motors_are_off_for_a_moment_then_braked_and_nothing_that_i
     assert all(braked[6:])
     assert not bench.robot.armed
     assert "disarmed: the left wheel does not count" in bench.events
+
+
+def test_the_protocols_cyclic_frames_are_those_of_the_dbc():
+    by_name = {frame.name: frame for frame in cyclic_frames(NoSettings(), 50.0, False)}
+    assert by_name["WHEEL_SPEED"] == CyclicFrame("WHEEL_SPEED", "ROBOT", 8, 100.0)
+    assert by_name["LIMITS"].rate_hz == 2.0
+    assert by_name["WHEEL_COMMAND"] == CyclicFrame("WHEEL_COMMAND", "HOST", 8, 50.0)
+    assert {frame.name: frame for frame in cyclic_frames(NoSettings(), 100.0, False)}["WHEEL_COMMAND"].rate_hz == 100.0
+    assert "ESTOP" not in by_name

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 
 import can
 import can.interfaces.virtual as virtual_bus
@@ -67,25 +68,12 @@ def test_any_error_frame_is_counted_somehow(error_class, data):
     assert set(error_counts(error_class, data).values()) <= {0, 1}
 
 
-A, B = Frame(0x100, b"\1"), Frame(0x100, b"\2")
+A, B, C = Frame(0x100, b"\1"), Frame(0x100, b"\2"), Frame(0x101, b"\1")
 
 
 @pytest.fixture
 def sent_frames():
     return SentFrames()
-
-
-def test_each_frame_sent_excuses_one_that_is_equal(sent_frames):
-    sent_frames.sent(0, A)
-    sent_frames.sent(0, A)
-    assert [sent_frames.is_echo(1, A) for _ in range(3)] == [True, True, False]
-
-
-def test_another_frame_is_no_echo_and_takes_no_excuse(sent_frames):
-    sent_frames.sent(0, A)
-    assert not sent_frames.is_echo(1, B)
-    assert not sent_frames.is_echo(1, Frame(0x101, A.data))
-    assert sent_frames.is_echo(1, A)
 
 
 def test_an_excuse_ends_after_a_second(sent_frames):
@@ -103,16 +91,15 @@ def test_a_frame_that_was_not_sent_excuses_nothing(sent_frames):
     sent_frames.not_sent(B)
 
 
-@examples(quick=40, every=100, events=st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
+@examples(quick=40, every=100, events=st.lists(st.tuples(st.sampled_from([A, B, C]), st.booleans()), max_size=40))
 def test_whoever_else_sends_is_heard_as_often_as_he_sends(events):
     """Echoes and another host's frames of the same contents, in any order: what is not excused is as many as his."""
     sent_frames = SentFrames()
     for frame, is_ours in events:
         if is_ours:
             sent_frames.sent(0, frame)
-    not_echoes = [frame for frame, _ in events if not sent_frames.is_echo(1, frame)]
-    strangers = [frame for frame, is_ours in events if not is_ours]
-    assert sorted(not_echoes, key=lambda frame: frame.data) == sorted(strangers, key=lambda frame: frame.data)
+    not_echoes = Counter(frame for frame, _ in events if not sent_frames.is_echo(1, frame))
+    assert not_echoes == Counter(frame for frame, is_ours in events if not is_ours)
 
 
 CHANNELS = (f"can-test-{number}" for number in itertools.count())
