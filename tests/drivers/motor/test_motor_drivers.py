@@ -22,6 +22,8 @@ WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
 
 
 ROBOCLAW = 'driver = "roboclaw"\nkind = "serial"\ncounts_per_rev = 8192.0\nwatchdog_s = 0.2\n'
+ODRIVE = 'driver = "odrive"\nvel_limit_turns_s = 10.0\n'
+VESC = f'driver = "vesc"\n{EXAMPLES["vesc"]}\n'
 
 
 def robot_toml(folder, link):
@@ -74,30 +76,18 @@ def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
     ("link", "expected_error"),
     [
         ("nodes = [3, 5]", r"link\.nodes: belongs to the driver odrive, but link.driver is reference; remove it"),
-        ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0', r"watchdog_s: missing; add it"),
-        ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.0', r"link\.watchdog_s"),
-        ('driver = "odrive"\nnodes = [3, 3]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.1', r"link\.nodes: .*twice"),
-        ('driver = "odrive"\nnodes = [3, 63]\nvel_limit_turns_s = 9.0\nwatchdog_s = 0.1', r"link\.nodes: .*0 to 62"),
+        (f"{ODRIVE}nodes = [3, 5]", r"watchdog_s: missing; add it"),
+        (f"{ODRIVE}nodes = [3, 5]\nwatchdog_s = 0.0", r"link\.watchdog_s"),
+        (f"{ODRIVE}nodes = [3, 3]\nwatchdog_s = 0.1", r"link\.nodes: .*twice"),
+        (f"{ODRIVE}nodes = [3, 63]\nwatchdog_s = 0.1", r"link\.nodes: .*0 to 62"),
         (f'{ROBOCLAW}motors = ["127/1", "128/2"]', r'link\.motors: "127/1" is no motor; write'),
         (f'{ROBOCLAW}motors = ["128/1", "128/1"]', r"link\.motors: a motor is listed twice"),
         (f'{ROBOCLAW}motors = ["128/1", []]', r"link\.motors: a side has no motor"),
-        (
-            f'{ROBOCLAW.replace("0.2", "0.25")}motors = ["128/1", "128/2"]',
-            r"watchdog_s: 0\.25 is not a multiple of 0\.1",
-        ),
-        (f'{ROBOCLAW.replace("serial", "can")}motors = ["128/1", "128/2"]', r'roboclaw does not .*; write "serial"'),
-        (
-            f'driver = "vesc"\nkind = "serial"\n{EXAMPLES["vesc"]}',
-            r"link\.uart_node: belongs to a serial line, .*add it",
-        ),
-        (
-            f'driver = "vesc"\n{EXAMPLES["vesc"]}uart_node = 23',
-            r"link\.uart_node: belongs to a serial line, .*remove it",
-        ),
-        (
-            f'driver = "vesc"\nkind = "serial"\n{EXAMPLES["vesc"]}uart_node = 9',
-            r"link\.uart_node: 9 is not in link\.nodes",
-        ),
+        (ROBOCLAW.replace("0.2", "0.25") + 'motors = ["128/1", "128/2"]', r"watchdog_s: 0\.25 is not a multiple"),
+        (ROBOCLAW.replace("serial", "can") + 'motors = ["128/1", "128/2"]', r'roboclaw does not .*; write "serial"'),
+        (f'{VESC}kind = "serial"', r"link\.uart_node: belongs to a serial line, .*add it"),
+        (f"{VESC}uart_node = 23", r"link\.uart_node: belongs to a serial line, .*remove it"),
+        (f'{VESC}kind = "serial"\nuart_node = 9', r"link\.uart_node: 9 is not in link\.nodes"),
         ("of_driver = 3", r"link\.of_driver: no such field"),
         ("gears = 3", r"gears: no such field"),
     ],

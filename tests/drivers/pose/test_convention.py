@@ -12,21 +12,14 @@ from disco_hw.runtime.assembly import driver_of, pose_source_of
 from drivers.motor import RewiredDriver
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample
-
-ROBOT = """[robot]
-name = "bench"
-wheel_radius_m = 0.06
-axial_distance_m = 0.31
-ticks_per_rev = 2048
-max_wheel_speed_rad_s = 8.0
-"""
+from tests.config.test_robot import GOOD
 
 
 @pytest.fixture
 def load(tmp_path):
     def loaded(text):
         path = tmp_path / "robot.toml"
-        path.write_text(ROBOT + text, encoding="utf-8")
+        path.write_text(GOOD + text, encoding="utf-8")
         return load_robot_config(path)
 
     return loaded
