@@ -57,7 +57,7 @@ def drive(bench, seconds=0.5):
     assert bench.robot.speed == pytest.approx(FORWARD, abs=0.02)
 
 
-def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
+def test_nothing_that_moves_is_sent_before_arming_and_nothing_moves_if_that_is_taken_back(vendor, bench):
     bench.command = command(*FORWARD)
     bench.run(1.0)
     assert bench.driver.state in IDLE_STATES
@@ -65,6 +65,10 @@ def test_nothing_that_moves_is_sent_before_arming(vendor, bench):
     bench.request(Request.READY).run(1.0)
     assert bench.driver.state is DriverState.READY
     assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
+    bench.request(Request.ARM).run(0.05)
+    bench.request(Request.STANDBY).run(1.0)
+    assert bench.driver.state in IDLE_STATES
+    assert bench.largest_speed == 0.0
 
 
 def test_a_controller_that_is_not_there_is_waited_for(vendor):
@@ -200,14 +204,6 @@ def test_disarming_ramps_down_and_says_so_until_it_stands(bench):
     bench.run(0.2)
     assert bench.robot.speed_rad_s < 0.05
     assert no_wheel_is_driven(bench)
-
-
-def test_an_arming_that_is_taken_back_moves_nothing(bench):
-    bench.run_until(*IDLE_STATES)
-    bench.request(Request.ARM).run(0.05, FORWARD)
-    bench.request(Request.STANDBY).run(1.0, FORWARD)
-    assert bench.driver.state in IDLE_STATES
-    assert bench.largest_speed == 0.0
 
 
 def test_one_side_lost_stops_the_other_and_is_a_fault_until_it_is_mended_and_reset(vendor, bench):

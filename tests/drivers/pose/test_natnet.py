@@ -27,7 +27,7 @@ def count(version, items):
     return struct.pack("<i", len(items)) + (struct.pack("<i", len(body)) if version >= (4, 1) else b"") + body
 
 
-def rigid_body(version, number, position, rotation, tracked=True):
+def rigid_body(version, number=3, position=(1.5, 0.1, -2.0), rotation=TURNED, tracked=True):
     body = struct.pack("<i3f4f", number, *position, *rotation)
     if version < (3, 0):
         body += struct.pack("<i6f2i2f", 2, *[0.1] * 6, 7, 8, 0.01, 0.01)
@@ -70,7 +70,7 @@ def frame(version, bodies, timestamp_s=12.5, exposed=1000 * TEN_MHZ, age_ticks=5
 @pytest.mark.parametrize("empty", [False, True])
 def test_every_version_gives_the_body_and_the_clock(version, empty):
     bodies = [
-        rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED),
+        rigid_body(version),
         rigid_body(version, 4, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), tracked=False),
     ]
     found = parse_frame(frame(version, bodies, empty=empty), version)
@@ -87,7 +87,7 @@ def test_another_library_reads_the_same(version):
     from natnet.packet_buffer import PacketBuffer
     from natnet.version import Version
 
-    datagram = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])
+    datagram = frame(version, [rigid_body(version)])
     buffer = PacketBuffer(datagram)
     buffer.pointer = 4
     theirs = library.DataFrame.read_from_buffer(buffer, Version(*version))
@@ -135,7 +135,7 @@ def test_axes_that_are_z_up_already_stay():
 )
 def test_no_bytes_break_it(datagram, version, at, change):
     assert parse_frame(datagram, version) is None or datagram[:2] == b"\x07\x00"
-    valid_frame = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])
+    valid_frame = frame(version, [rigid_body(version)])
     parse_frame(valid_frame[:at] + change + valid_frame[at + len(change) :], version)
     assert parse_frame(valid_frame[: min(at, 60)], version) is None
 
@@ -155,7 +155,7 @@ class Motive:
 def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     version, motive = (3, 0), Motive()
     source = create_pose_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
-    body = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)
+    body = rigid_body(version)
     # The clock's frequency shows in half a second of the server's own time.
     motive.send(port, frame(version, [body], timestamp_s=1.0, exposed=TEN_MHZ))
     motive.send(port, frame(version, [body], timestamp_s=2.0, exposed=2 * TEN_MHZ))
@@ -165,8 +165,8 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     assert {pose.received_ns - pose.t_ns for pose in found} == {0, 5_000_000}
     assert (found[1].x_m, found[1].y_m, found[1].yaw_rad) == pytest.approx((1.5, 2.0, 0.7), abs=1e-6)
     assert (found[1].position_std_m, found[1].yaw_std_rad) == (0.002, 0.004)
-    unseen = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED, tracked=False)
-    nan = rigid_body(version, 3, (math.nan, 0.1, -2.0), TURNED)
+    unseen = rigid_body(version, tracked=False)
+    nan = rigid_body(version, position=(math.nan, 0.1, -2.0))
     motive.send(
         port, frame(version, [unseen]), frame(version, [nan]), frame(version, [unseen]), b"hello", frame(version, [])
     )
@@ -195,7 +195,7 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, mo
             b"Motive".ljust(256, b"\0") + bytes([3, 1, 0, 0, 4, 1, 0, 0]) + struct.pack("<QHB4s", TEN_MHZ, 1511, 0, b"")
         )
         server.sendto(struct.pack("<HH", 1, len(about)) + about, client)
-        server.sendto(frame((4, 1), [rigid_body((4, 1), 3, (1.5, 0.1, -2.0), TURNED)]), client)
+        server.sendto(frame((4, 1), [rigid_body((4, 1))]), client)
         (pose,), _ = until(source, lambda found, _: found)
         assert pose.received_ns - pose.t_ns == 5_000_000
         source.close()
@@ -214,7 +214,7 @@ def test_frames_of_a_second_server_are_refused_and_named(port):
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
     ):
         for sender, x_m in ((one, 1.0), (two, 5.0), (one, 1.1)):
-            sender.sendto(frame(version, [rigid_body(version, 3, (x_m, 0.1, -2.0), TURNED)]), ("127.0.0.1", port))
+            sender.sendto(frame(version, [rigid_body(version, position=(x_m, 0.1, -2.0))]), ("127.0.0.1", port))
         names = [f"127.0.0.1:{sender.getsockname()[1]}" for sender in (one, two)]
         found, messages = until(source, lambda found, _: len(found) == 2)
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
@@ -224,7 +224,7 @@ def test_frames_of_a_second_server_are_refused_and_named(port):
 
 def test_a_frame_with_more_than_motive_can_send_is_none():
     version = (3, 0)
-    one = [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)]
+    one = [rigid_body(version)]
     valid_frame = frame(version, one, empty=True)
     # After size, number of the frame and its head: so many marker sets, none of which has a name or a marker.
     sets = b"\0" + struct.pack("<i", 0)
