@@ -152,9 +152,9 @@ class Motive:
             self.socket.sendto(datagram, (group, port))
 
 
-def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
+def test_by_multicast_with_the_exposures_age_and_a_lost_body(create_source, port):
     version, motive = (3, 0), Motive()
-    source = create_pose_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
+    source = create_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
     body = rigid_body(version)
     # The clock's frequency shows in half a second of the server's own time.
     motive.send(port, frame(version, [body], timestamp_s=1.0, exposed=TEN_MHZ))
@@ -181,12 +181,12 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     assert list(source.receive(1, ())) == []
 
 
-def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, monkeypatch):
+def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(create_source, port, monkeypatch):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(("127.0.0.1", 0))
         server.settimeout(60.0)
         monkeypatch.setattr("drivers.pose.natnet.COMMAND_PORT", server.getsockname()[1])
-        source = create_pose_source("natnet", data_port=port, server="127.0.0.1", natnet_version="2.9", body=3)
+        source = create_source("natnet", data_port=port, server="127.0.0.1", natnet_version="2.9", body=3)
         assert list(source.receive(0, ())) == []
         connect, client = server.recvfrom(100)
         keep_alive, _ = server.recvfrom(100)
@@ -206,9 +206,9 @@ def test_an_address_that_is_not_this_computers_is_one_line():
         create_pose_source("natnet", address="203.0.113.7")
 
 
-def test_frames_of_a_second_server_are_refused_and_named(port):
+def test_frames_of_a_second_server_are_refused_and_named(create_source, port):
     version = (3, 0)
-    source = create_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+    source = create_source("natnet", data_port=port, server="127.0.0.1", body=3)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
@@ -219,7 +219,6 @@ def test_frames_of_a_second_server_are_refused_and_named(port):
         found, messages = until(source, lambda found, _: len(found) == 2)
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
     assert any(f"{names[1]} sends poses while {names[0]} does: not used" in message for message in messages)
-    source.close()
 
 
 def test_a_frame_with_more_than_motive_can_send_is_none():
@@ -234,8 +233,8 @@ def test_a_frame_with_more_than_motive_can_send_is_none():
         assert (found is not None) == is_read
 
 
-def test_a_flood_of_long_datagrams_waits_for_the_next_tick(port):
-    source = create_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+def test_a_flood_of_long_datagrams_waits_for_the_next_tick(create_source, port):
+    source = create_source("natnet", data_port=port, server="127.0.0.1", body=3)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(3):
             sender.sendto(bytes(40_000), ("127.0.0.1", port))
@@ -243,4 +242,3 @@ def test_a_flood_of_long_datagrams_waits_for_the_next_tick(port):
     assert source.malformed == 2
     assert list(source.receive(2, ())) == []
     assert source.malformed == 3
-    source.close()

@@ -144,14 +144,6 @@ def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     assert night.host_ns(18.0, 2 * 10**9) == 2 * 10**9
 
 
-@pytest.fixture
-def ended():
-    sources = []
-    yield sources.append
-    for source in sources:
-        source.close()
-
-
 def until(source, enough):
     """Poses and messages of the source until `enough(poses, messages)`, within a generous time."""
     found, messages = [], []
@@ -169,11 +161,10 @@ def opened(source):
     until(source, lambda _, messages: any(message.endswith(": open") for message in messages))
 
 
-def test_over_a_serial_port_that_goes_away(ended):
+def test_over_a_serial_port_that_goes_away(create_source):
     master, slave = os.openpty()
     tty.setraw(slave)
-    source = create_pose_source("nmea", device=os.ttyname(slave), baud=115_200)
-    ended(source)
+    source = create_source("nmea", device=os.ttyname(slave), baud=115_200)
     _, messages = until(source, lambda _, messages: messages)
     assert messages[0].endswith(": open")
     os.write(master, b"half a line*00\r\n" + GGA_ALONE)
@@ -187,11 +178,10 @@ def test_over_a_serial_port_that_goes_away(ended):
     assert "trying again until it is there" in messages[-1]
 
 
-def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
+def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(create_source):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        source = create_pose_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
-        ended(source)
+        source = create_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
         receiver, _ = server.accept()
         opened(source)
         with receiver:
@@ -207,10 +197,9 @@ def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
             assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
-def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(ended):
+def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(create_source):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        source = create_pose_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
-        ended(source)
+        source = create_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
         receiver, _ = server.accept()
         opened(source)
         stack = simulated_stack(NoPlanner())

@@ -200,11 +200,17 @@ def medium():
 
 
 @pytest.fixture
-def transport(medium):
+def unopened(medium):
     transport = ReconnectingTransport(medium, backoff=FAST)
     yield transport
     medium.may_write.set()
     transport.close()
+
+
+@pytest.fixture
+def transport(unopened):
+    up(unopened)
+    return unopened
 
 
 def up(transport, generation=1):
@@ -213,8 +219,6 @@ def up(transport, generation=1):
 
 
 def test_carries_frames_both_ways_of_any_identifier_and_length(transport, medium):
-    assert transport.state is LinkState.CLOSED
-    up(transport)
     for frame in (Frame(0x101, b"\x07"), Frame(0, b""), Frame(0x7FF, bytes(8))):
         send(transport, outgoing(frame.can_id, frame.data))
         wait_until(lambda: medium.sent and medium.sent[-1] == frame)  # noqa: B023
@@ -227,17 +231,17 @@ def test_carries_frames_both_ways_of_any_identifier_and_length(transport, medium
     assert transport.stats.bytes_received == 4
 
 
-def test_keeps_trying_until_the_device_is_there(transport, medium):
+def test_keeps_trying_until_the_device_is_there(unopened, medium):
+    assert unopened.state is LinkState.CLOSED
     medium.refusals = [OSError("not there"), RuntimeError("odd"), KeyError("odder")]
-    up(transport)
+    up(unopened)
     assert medium.attempts == 4
-    assert transport.last_error is None
-    assert transport.stats.reconnects == 0
+    assert unopened.last_error is None
+    assert unopened.stats.reconnects == 0
 
 
 @pytest.mark.parametrize("error", [OSError("unplugged"), IndexError("bug in a backend"), LinkLostError("bus-off")])
 def test_any_error_while_receiving_is_counted_and_the_link_made_anew(transport, medium, error):
-    up(transport)
     medium.incoming.put(error)
     up(transport, generation=2)
     assert transport.stats.receive_errors == 1
@@ -249,7 +253,6 @@ def test_any_error_while_receiving_is_counted_and_the_link_made_anew(transport, 
 
 def test_an_error_while_sending_makes_the_link_anew(transport, medium):
     """Some backends report a dead line only when sending; receiving would be silent for ever."""
-    up(transport)
     medium.write_error = BrokenPipeError("server gone")
     send(transport, outgoing())
     wait_until(lambda: transport.generation >= 2)
@@ -291,14 +294,12 @@ def test_a_device_that_is_absent_or_flaps_is_tried_less_and_less_often(medium, f
 
 
 def test_an_idle_link_costs_nothing(transport):
-    up(transport)
     before_s, cpu_before_s = time.monotonic(), time.process_time()
     time.sleep(0.3)
     assert time.process_time() - cpu_before_s < 0.5 * (time.monotonic() - before_s)
 
 
 def test_nothing_old_is_sent_on_a_new_link(transport, medium):
-    up(transport)
     medium.may_write.clear()
     send(transport, outgoing(data=b"a"), outgoing(data=b"b"))
     wait_until(transport._writing.locked)
@@ -313,7 +314,6 @@ def test_nothing_old_is_sent_on_a_new_link(transport, medium):
 
 
 def test_frames_received_on_the_old_link_are_not_delivered_on_the_new(transport, medium):
-    up(transport)
     medium.incoming.put([ReceivedFrame(1, Frame(1, b"old"))])
     wait_until(lambda: transport.stats.frames_received == 1)
     medium.incoming.put(OSError("unplugged"))
@@ -321,16 +321,15 @@ def test_frames_received_on_the_old_link_are_not_delivered_on_the_new(transport,
     assert transport.receive() == ()
 
 
-def test_no_sending_while_the_link_is_down(transport, medium):
+def test_no_sending_while_the_link_is_down(unopened, medium):
     medium.refusals = [OSError("not there")] * 100_000
-    transport.open()
-    wait_until(lambda: transport.last_error == "scripted: not there")
-    assert not transport.send(outgoing(), time.monotonic_ns())
-    assert transport.stats.send_errors == 1
+    unopened.open()
+    wait_until(lambda: unopened.last_error == "scripted: not there")
+    assert not unopened.send(outgoing(), time.monotonic_ns())
+    assert unopened.stats.send_errors == 1
 
 
 def test_a_late_frame_is_never_sent(transport, medium):
-    up(transport)
     assert not transport.send(OutgoingFrame(Frame(1, b""), 999), 1_000)
     assert transport.stats.expired == 1
     medium.may_write.clear()
@@ -346,7 +345,6 @@ def test_a_late_frame_is_never_sent(transport, medium):
 
 
 def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fits(transport, medium):
-    up(transport)
     medium.may_write.clear()
     send(transport, outgoing(0x300))
     wait_until(transport._writing.locked)
@@ -361,7 +359,6 @@ def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fi
 
 
 def test_no_room_on_the_medium_is_counted_once_a_frame_and_tried_again(transport, medium):
-    up(transport)
     medium.write_error = TransmitBusyError("ENOBUFS")
     send(transport, outgoing(0x100, b"kept"))
     wait_until(lambda: transport.stats.transmit_queue_full)
@@ -374,7 +371,6 @@ def test_no_room_on_the_medium_is_counted_once_a_frame_and_tried_again(transport
 
 
 def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(transport, medium):
-    up(transport)
     total = reconnecting.RECEIVE_CAPACITY + 10
     medium.incoming.put([ReceivedFrame(number, Frame(1, b"")) for number in range(total)])
     wait_until(lambda: transport.stats.receive_overflow == 10)
@@ -384,7 +380,6 @@ def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(tran
 
 def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium, monkeypatch):
     monkeypatch.setattr(reconnecting, "_DRAIN_S", 10.0)
-    up(transport)
     frames = [outgoing(0x080, bytes((number,))) for number in range(20)]
     send(transport, *frames)
     transport.close()
@@ -397,14 +392,12 @@ def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium, mo
 
 
 def test_opening_twice_starts_one_pair_of_threads(transport, medium):
-    up(transport)
     transport.open()
     assert len([thread for thread in threading.enumerate() if thread.name.startswith("scripted")]) == 2
 
 
 @pytest.mark.parametrize("frame", [Frame(0x800, b""), Frame(-1, b""), Frame(1, bytes(9)), Frame(1, b"", extended=True)])
 def test_what_is_no_can_frame_is_the_callers_error(transport, frame):
-    up(transport)
     with pytest.raises(ValueError, match="not a classic CAN frame"):
         transport.send(OutgoingFrame(frame, 10), 1)
 
