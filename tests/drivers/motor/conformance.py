@@ -15,6 +15,32 @@ from tests.drivers.motor.bench import FORWARD, IDLE_STATES, Bench
 from tests.tables import thinned
 
 
+def check_that_wheels_follow(bench, speed_tolerance_rad_s, angle_tolerance_rad):
+    """Arm, which moves nothing, and command speeds, which the wheels take up and the samples report."""
+    bench.arm()
+    assert bench.largest_speed == 0.0, "arming alone moves nothing"
+    bench.run(1.0, FORWARD)
+    speeds = pytest.approx(FORWARD, abs=speed_tolerance_rad_s)
+    last = bench.wheels[-1]
+    assert bench.robot.speed == speeds
+    assert (last.left_speed_rad_s, last.right_speed_rad_s) == speeds
+    for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
+        moved = getattr(last, name) - getattr(bench.wheels[0], name)
+        behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9
+        assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=angle_tolerance_rad)
+
+
+def check_that_what_is_no_command_is_refused(bench):
+    bench.arm()
+    sent = bench.driver.stats.commands_sent
+    speeds = [WheelCommand(*bad, 0.1) for bad in ((math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf))]
+    durations = [WheelCommand(0.0, 0.0, valid_for_s) for valid_for_s in (math.nan, 0.0, -1.0)]
+    for command in speeds + durations:
+        with pytest.raises(ValueError, match="not a wheel command"):
+            bench.driver.transmit(bench.now_ns, command)
+        assert bench.driver.stats.commands_sent == sent, command
+
+
 class DriverConformance:
     """The suite; `watchdog_s` and `deceleration_rad_s2` are those of the controller."""
 
@@ -58,18 +84,9 @@ class DriverConformance:
         assert bench.largest_speed == 0.0
 
     def test_armed_the_wheels_follow_the_command_and_the_samples_say_so(self, bench):
-        bench.arm()
+        bench.run_until(*IDLE_STATES)
+        check_that_wheels_follow(bench, 0.005, 4 * math.pi / bench.driver.limits.ticks_per_rev.value + 0.02)
         assert bench.robot.armed
-        assert bench.largest_speed == 0.0, "arming alone moves nothing"
-        bench.run(1.0, FORWARD)
-        assert bench.robot.speed == pytest.approx(FORWARD, abs=0.005)
-        last = bench.wheels[-1]
-        assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.005)
-        resolution = 2 * math.pi / bench.driver.limits.ticks_per_rev.value
-        for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
-            moved = getattr(last, name) - getattr(bench.wheels[0], name)
-            behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9
-            assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=2 * resolution + 0.02)
 
     def test_a_silent_host_stops_the_robot_and_is_not_armed_when_it_comes_back(self, bench):
         bench.drive(0.6, FORWARD)
@@ -221,14 +238,7 @@ class DriverConformance:
     estop_id = 0x080
 
     def test_a_command_that_is_none_is_the_callers_error(self, bench):
-        bench.arm()
-        sent = bench.driver.stats.commands_sent
-        speeds = [WheelCommand(*bad, 0.1) for bad in ((math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf))]
-        durations = [WheelCommand(0.0, 0.0, valid_for_s) for valid_for_s in (math.nan, 0.0, -1.0)]
-        for command in speeds + durations:
-            with pytest.raises(ValueError, match="not a wheel command"):
-                bench.driver.transmit(bench.now_ns, command)
-        assert bench.driver.stats.commands_sent == sent
+        check_that_what_is_no_command_is_refused(bench)
 
     def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
         bench.drive(0.6, FORWARD)

@@ -11,6 +11,7 @@ import pytest
 from drivers.motor import find_driver
 from drivers.types import DriverState, Request, WheelCommand
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
+from tests.drivers.motor.conformance import check_that_what_is_no_command_is_refused, check_that_wheels_follow
 from tests.drivers.motor.vendors import VENDORS
 from tests.tables import thinned
 
@@ -87,15 +88,7 @@ def test_a_controller_that_is_not_there_is_waited_for(vendor):
 
 
 def test_armed_the_wheels_follow_and_the_samples_say_so(new_bench):
-    new_bench.arm()
-    assert new_bench.largest_speed == 0.0, "arming alone moves nothing"
-    new_bench.run(1.0, FORWARD)
-    last = new_bench.wheels[-1]
-    assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.02)
-    for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
-        moved = getattr(last, name) - getattr(new_bench.wheels[0], name)
-        behind = new_bench.robot.speed[wheel] * (new_bench.now_ns - last.t_ns) * 1e-9
-        assert moved == pytest.approx(new_bench.robot.angle[wheel] - behind, abs=0.05)
+    check_that_wheels_follow(new_bench, 0.02, 0.05)
 
 
 IDENTITIES = {
@@ -367,12 +360,7 @@ def test_garbage_is_counted_never_raises_and_never_moves_faster(new_bench):
 
 
 def test_a_command_that_is_none_is_the_callers_error(new_bench):
-    new_bench.arm()
-    sent = new_bench.driver.stats.commands_sent
-    for bad in [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)]:
-        with pytest.raises(ValueError, match="not a wheel command"):
-            new_bench.driver.transmit(new_bench.now_ns, command(*bad))
-        assert new_bench.driver.stats.commands_sent == sent, bad
+    check_that_what_is_no_command_is_refused(new_bench)
 
 
 def test_it_arms_again_only_on_request_and_does_not_forget_on_the_way_what_was_wanted(bench):

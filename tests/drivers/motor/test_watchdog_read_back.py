@@ -19,21 +19,37 @@ def vescs(bench):
     return [vesc for side in bench.robot.controller.sides for vesc in side]
 
 
+def set_vesc(name, value):
+    return lambda bench: setattr(vescs(bench)[1], name, value)
+
+
+def set_odrive(number, value):
+    return lambda bench: bench.robot.controller.boards[1].parameters.update({number: value})
+
+
 @pytest.mark.parametrize(
-    ("field", "value", "expected_detail"),
+    ("vendor", "change", "expected_detail"),
     [
-        ("timeout_ms", 0, "controller 51: its timeout is off"),
-        ("timeout_ms", 1000, "controller 51: its timeout is 1 s; set 0.1 s there"),
-        ("timeout_brake_current_a", 30.0, "brakes with 30 A"),
+        (VESC, set_vesc("timeout_ms", 0), "controller 51: its timeout is off"),
+        (VESC, set_vesc("timeout_ms", 1000), "controller 51: its timeout is 1 s; set 0.1 s there"),
+        (VESC, set_vesc("timeout_brake_current_a", 30.0), "brakes with 30 A"),
+        (ODRIVE, set_odrive(220, bytes(4)), "node 5: its watchdog is off"),
+        (ODRIVE, set_odrive(221, struct.pack("<f", 2.0)), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
+        (
+            ODRIVE,
+            lambda bench: bench.robot.controller.boards[0].parameters.clear(),
+            "node 3 does not report its watchdog; correct link.watchdog_endpoints",
+        ),
     ],
+    ids=str,
 )
-def test_a_vesc_whose_timeout_is_another_is_refused(field, value, expected_detail):
-    bench = VESC.bench()
-    setattr(vescs(bench)[1], field, value)
+def test_a_controller_whose_watchdog_is_another_or_not_where_it_should_be_is_refused(vendor, change, expected_detail):
+    bench = vendor.bench()
+    change(bench)
     bench.run_until(DriverState.REFUSED)
     assert expected_detail in bench.driver.detail
     assert bench.driver.identity is bench.driver.limits is None
-    assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
+    assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
 
 
 def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():
@@ -48,27 +64,6 @@ def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():
 @pytest.mark.parametrize("payload", [b"", b"\x11", struct.pack(">BIBIf", 17, 1, 24, 100, 0.0), b"\x32" + bytes(20)])
 def test_settings_of_another_layout_or_controller_are_not_used(payload):
     assert timeout(payload, 23) is None
-
-
-@pytest.mark.parametrize(
-    ("number", "value", "expected_detail"),
-    [
-        (220, bytes(4), "node 5: its watchdog is off"),
-        (221, struct.pack("<f", 2.0), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
-    ],
-)
-def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, expected_detail):
-    bench = ODRIVE.bench()
-    bench.robot.controller.boards[1].parameters[number] = value
-    bench.run_until(DriverState.REFUSED)
-    assert expected_detail in bench.driver.detail
-
-
-def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
-    bench = ODRIVE.bench()
-    bench.robot.controller.boards[0].parameters.clear()
-    bench.run_until(DriverState.REFUSED)
-    assert "node 3 does not report its watchdog; correct link.watchdog_endpoints" in bench.driver.detail
 
 
 @pytest.mark.parametrize(
