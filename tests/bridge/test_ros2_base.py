@@ -39,8 +39,7 @@ JOINTS = {"left_joints": ("fl", "rl"), "right_joints": ("fr", "rr")}
 
 
 def settings(**fields):
-    given = {"wheel_radius_m": 0.1, "track_m": 0.5, "max_speed_m_s": 1.0, "watchdog_s": 0.5}
-    return wire.Ros2BaseSettings(**{**given, **fields})
+    return wire.Ros2BaseSettings(wheel_radius_m=0.1, track_m=0.5, max_speed_m_s=1.0, watchdog_s=0.5, **fields)
 
 
 def joints(at_ms, angles=(1.0, 2.0), speeds=(0.5, 1.5), names=("fl", "fr", "rl", "rr", "arm"), stamp=True):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
-from tests.drivers.pose.test_nmea import until
+from tests.drivers.waiting import receive_until
 from tests.tables import examples
 
 # Turned by 0.7 rad about Motive's upward axis y, at 1.5 m along x and 2 m towards the viewer (z).
@@ -159,7 +159,7 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(create_source, port
     # The clock's frequency shows in half a second of the server's own time.
     motive.send(port, frame(version, [body], timestamp_s=1.0, exposed=TEN_MHZ))
     motive.send(port, frame(version, [body], timestamp_s=2.0, exposed=2 * TEN_MHZ))
-    found, messages = until(source, lambda found, _: len(found) == 2)
+    found, messages = receive_until(source, lambda found, _: len(found) == 2)
     assert messages == ["rigid body 3 is tracked"]
     # The first one's age is not known; the second was exposed 5 ms before it was sent.
     assert {pose.received_ns - pose.t_ns for pose in found} == {0, 5_000_000}
@@ -170,7 +170,7 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(create_source, port
     motive.send(
         port, frame(version, [unseen]), frame(version, [nan]), frame(version, [unseen]), b"hello", frame(version, [])
     )
-    found, messages = until(source, lambda _, messages: len(messages) == 3)
+    found, messages = receive_until(source, lambda _, messages: len(messages) == 3)
     assert found == []
     assert messages[0] == "the cameras do not see rigid body 3; check its markers"
     assert messages[1] == "datagrams received that are not frames of NatNet 3.0; correct pose.natnet_version"
@@ -196,7 +196,7 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(create_s
         )
         server.sendto(struct.pack("<HH", 1, len(about)) + about, client)
         server.sendto(frame((4, 1), [rigid_body((4, 1))]), client)
-        (pose,), _ = until(source, lambda found, _: found)
+        (pose,), _ = receive_until(source, lambda found, _: found)
         assert pose.received_ns - pose.t_ns == 5_000_000
         source.close()
 
@@ -216,7 +216,7 @@ def test_frames_of_a_second_server_are_refused_and_named(create_source, port):
         for sender, x_m in ((one, 1.0), (two, 5.0), (one, 1.1)):
             sender.sendto(frame(version, [rigid_body(version, position=(x_m, 0.1, -2.0))]), ("127.0.0.1", port))
         names = [f"127.0.0.1:{sender.getsockname()[1]}" for sender in (one, two)]
-        found, messages = until(source, lambda found, _: len(found) == 2)
+        found, messages = receive_until(source, lambda found, _: len(found) == 2)
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
     assert any(f"{names[1]} sends poses while {names[0]} does: not used" in message for message in messages)
 

@@ -6,7 +6,6 @@ import re
 import shutil
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 import msgspec
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 
 from drivers.pose import PoseSourceError
 from drivers.pose.udp import pose_of
+from tests.drivers.waiting import receive_until
 
 NOW_NS = 100_000_000_000
 POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
@@ -114,12 +114,8 @@ def sent_from_the_page(language, port):
 
 
 def arrived(source):
-    end_s = time.monotonic() + 60.0
-    while not (poses := source.receive(NOW_NS, ())):
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
-    (pose,) = poses
-    return pose.x_m, pose.y_m, pose.yaw_rad, NOW_NS - pose.t_ns
+    (pose,), _ = receive_until(source, lambda found, _: found)
+    return pose.x_m, pose.y_m, pose.yaw_rad, pose.received_ns - pose.t_ns
 
 
 def test_the_pages_sender_in_python(create_source, port):
