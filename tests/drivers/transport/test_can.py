@@ -337,34 +337,27 @@ def test_a_bus_over_a_port_that_stays_mute_is_opened_again(terminal):
         assert "no frame received for 0.2 s" in transport.last_error
 
 
-@pytest.fixture
-def hub(tmp_path):
-    """A hub in a process of its own; call to start, call the result to stop it."""
-    path = tmp_path / "bus"
-    processes = []
-
-    def start():
-        process = subprocess.Popen([sys.executable, HUB_PROCESS, str(path)], stdout=subprocess.PIPE, text=True)
-        processes.append(process)
+@contextlib.contextmanager
+def hub_process(path):
+    """A hub in a process of its own, which is killed at the end."""
+    process = subprocess.Popen([sys.executable, HUB_PROCESS, path], stdout=subprocess.PIPE, text=True)
+    try:
         assert "ready" in process.stdout.readline()
-        return process
-
-    yield path, start
-    for process in processes:
+        yield
+    finally:
         process.kill()
         process.wait()
         process.stdout.close()
 
 
-def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
-    path, start = hub
-    with opened_bus("unixcan", str(path)) as transport:
+def test_between_processes_through_the_hub_that_dies_and_comes_back(tmp_path):
+    path = str(tmp_path / "bus")
+    with opened_bus("unixcan", path) as transport:
         wait_until(lambda: transport.last_error)
         assert "start the other end first" in transport.last_error
-        process = start()
         for generation in (1, 2):
-            up(transport, generation)
-            with other_node("unixcan", str(path)) as other:
+            with hub_process(path), other_node("unixcan", path) as other:
+                up(transport, generation)
                 before_ns = time.monotonic_ns()
                 other.send(message(0x110, b"\x05"))
                 (received,) = collect(transport, 1)
@@ -372,12 +365,8 @@ def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
                 assert before_ns - 1_000_000 <= received.t_ns <= time.monotonic_ns()
                 send(transport, outgoing(0x100, b"\x06"))
                 assert bytes(other.recv(5.0).data) == b"\x06"
-            if generation == 1:
-                process.kill()
-                process.wait()
-                wait_until(lambda: transport.state is LinkState.CONNECTING)
-                assert not transport.send(outgoing(), time.monotonic_ns())
-                start()
+            wait_until(lambda: transport.state is LinkState.CONNECTING)
+            assert not transport.send(outgoing(), time.monotonic_ns())
 
 
 @pytest.fixture
