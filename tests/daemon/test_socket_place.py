@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -19,11 +18,12 @@ from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.daemon import ask, believed_users, default_socket_path, passed_over, send_request, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import WorkError
+from tests.daemon.control_daemon import ControlDaemon
 from tests.hil.stack import disco_here
 
 ME = os.geteuid()
 NOBODY = 65534
-SHIPPED = (SHIPPED_ROBOT).read_text(encoding="utf-8")
+SHIPPED = SHIPPED_ROBOT.read_text(encoding="utf-8")
 needs_root = pytest.mark.skipif(ME != 0, reason="needs root to act as a second user")
 
 REPLY = b'{"ok": true, "text": "the stranger says", "robot_state": "ESTOP", "robot_state_ns": 9e18, "link": "up"}\n'
@@ -156,11 +156,12 @@ def test_a_directory_of_another_user_is_not_believed(tmp_path, monkeypatch):
 
 
 def test_a_listener_of_another_user_is_not_believed(tmp_path, monkeypatch):
-    server = ControlServer(tmp_path / "x.sock", ["status"])
     monkeypatch.setattr(client, "peer_uid", lambda connection: NOBODY)
-    with pytest.raises(WorkError, match=r"a process of .*65534.* listens there; nothing is sent"):
-        send_request(server.path, {"do": "status"})
-    server.close()
+    with (
+        closing(ControlServer(tmp_path / "x.sock", ["status"])),
+        pytest.raises(WorkError, match=r"a process of .*65534.* listens there; nothing is sent"),
+    ):
+        send_request(tmp_path / "x.sock", {"do": "status"})
 
 
 # --- a second user ----------------------------------------------------------------------------------------------------
@@ -171,22 +172,9 @@ def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_pa
     occupied = temporary / f"disco-hw-{ME}"
     with as_nobody(serve_as_a_daemon(occupied / "wombot.sock")):
         robot = robot_file(tmp_path)
-        server = ControlServer(default_socket_path("wombot"), ["disarm"])
-        ending = threading.Event()
-
-        def serve():
-            while not ending.wait(0.002):
-                for message in server.poll():
-                    server.reply(message, {"ok": True, "text": "the daemon says"})
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
+        daemon = ControlDaemon(default_socket_path("wombot"), lambda _: {"ok": True, "text": "the daemon says"})
+        with closing(daemon):
             assert ask(robot, "disarm")["text"] == "the daemon says"
-        finally:
-            ending.set()
-            thread.join()
-            server.close()
         assert capsys.readouterr().err == f"disco-hw: {occupied}: belongs to nobody (65534); not used\n"
 
 

@@ -13,13 +13,12 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from disco_hw.daemon import SERVED
-from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.viewer import operator_controls as desk_module
 from disco_hw.viewer.operator_controls import Desk, shown
 from disco_hw.viewer.server import serving
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import encode_frame
+from tests.daemon.control_daemon import ControlDaemon
 from tests.drivers.waiting import wait_until
 from tests.viewer.test_server import get
 from tools.viewer_run import ROBOT_FILE
@@ -32,38 +31,19 @@ STATUS = {
 }  # fmt: skip
 
 
-class Daemon:
-    """A control socket that accepts everything but `arm`, and keeps what it was asked; it can be made to hang."""
+class Daemon(ControlDaemon):
+    """Accepts everything but `arm`."""
 
     def __init__(self, directory):
-        directory.mkdir(mode=0o700)
-        self.server = ControlServer(directory / "control.sock", SERVED)
-        self.received, self.hangs, self._ending = [], False, threading.Event()
         self.status = STATUS
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
+        super().__init__(directory / "control.sock", self._reply_to)
 
-    def _serve(self):
-        while not self._ending.is_set():
-            for message in [] if self.hangs else self.server.poll():
-                self.received.append((message.action, message.arguments))
-                self.server.reply(message, self._reply(message))
-            time.sleep(0.002)
-
-    def _reply(self, message):
+    def _reply_to(self, message):
         if message.action == "status":
             return self.status
         if message.action == "drive":
             return {"ok": True, "stamp": str(1_000 + len(self.received))}
         return {"ok": message.action != "arm", "text": "done it", "error": "not now"}
-
-    def actions(self, *but):
-        return [action for action, _ in self.received if action not in but]
-
-    def close(self):
-        self._ending.set()
-        self._thread.join()
-        self.server.close()
 
 
 @pytest.fixture
