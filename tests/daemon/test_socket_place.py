@@ -103,6 +103,15 @@ def serve_as_a_daemon(path):
     return act
 
 
+@pytest.fixture
+def service():
+    """A directory of a service user's alone, put by root where only root can."""
+    place = Path(tempfile.mkdtemp(prefix="dhw", dir="/run"))
+    os.chown(place, NOBODY, NOBODY)
+    yield place
+    shutil.rmtree(place)
+
+
 def robot_file(directory, extra=""):
     path = directory / "robot.toml"
     text = SHIPPED.replace("/tmp/disco-hw-wombot.can", "/nowhere/bus")
@@ -225,34 +234,22 @@ def test_a_configured_socket_of_another_user_is_refused_in_one_line(tmp_path, mo
 
 
 @needs_root
-def test_root_reaches_the_daemon_of_a_service_user():
+def test_root_reaches_the_daemon_of_a_service_user(service):
     # As /run/disco-hw-NAME of the service: put there by root, and the service user's alone.
-    base = Path("/run") if os.access("/run", os.W_OK) else Path("/root")
-    service = Path(tempfile.mkdtemp(prefix="dhw", dir=base))
-    try:
-        service.chmod(0o700)
-        os.chown(service, NOBODY, NOBODY)
-        path = service / "disco-hw" / "wombot.sock"
-        with as_nobody(serve_as_a_daemon(path)):
-            path.parent.chmod(0o700)
-            assert believed_users(path) == {0, NOBODY}
-            assert send_request(path, {"do": "disarm"})["text"] == "the stranger says"
-    finally:
-        shutil.rmtree(service)
+    path = service / "disco-hw" / "wombot.sock"
+    with as_nobody(serve_as_a_daemon(path)):
+        path.parent.chmod(0o700)
+        assert believed_users(path) == {0, NOBODY}
+        assert send_request(path, {"do": "disarm"})["text"] == "the stranger says"
 
 
 @needs_root
-def test_root_finds_it_by_the_runtime_directory_of_the_service(monkeypatch, temporary):
-    service = Path(tempfile.mkdtemp(prefix="dhw", dir="/run"))
-    try:
-        os.chown(service, NOBODY, NOBODY)
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(service))
-        assert default_socket_path("wombot").parent == temporary / "disco-hw-0"
-        with as_nobody(serve_as_a_daemon(service / "disco-hw" / "wombot.sock")):
-            assert default_socket_path("wombot") == service / "disco-hw" / "wombot.sock"
-            assert passed_over(default_socket_path("wombot")) == ()
-    finally:
-        shutil.rmtree(service)
+def test_root_finds_it_by_the_runtime_directory_of_the_service(monkeypatch, temporary, service):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(service))
+    assert default_socket_path("wombot").parent == temporary / "disco-hw-0"
+    with as_nobody(serve_as_a_daemon(service / "disco-hw" / "wombot.sock")):
+        assert default_socket_path("wombot") == service / "disco-hw" / "wombot.sock"
+        assert passed_over(default_socket_path("wombot")) == ()
 
 
 @needs_root
