@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 import time
+from contextlib import closing
 
 import msgspec
 import pytest
@@ -38,8 +39,7 @@ JOINTS = {"left_joints": ("fl", "rl"), "right_joints": ("fr", "rr")}
 
 
 def settings(**fields):
-    given = {"wheel_radius_m": 0.1, "track_m": 0.5, "max_speed_m_s": 1.0, "watchdog_s": 0.5}
-    return wire.Ros2BaseSettings(**{**given, **fields})
+    return wire.Ros2BaseSettings(wheel_radius_m=0.1, track_m=0.5, max_speed_m_s=1.0, watchdog_s=0.5, **fields)
 
 
 def joints(at_ms, angles=(1.0, 2.0), speeds=(0.5, 1.5), names=("fl", "fr", "rl", "rr", "arm"), stamp=True):
@@ -57,36 +57,33 @@ def odometry(at_ms, x, y, yaw, speed=0.0, turn=0.0):
     return msg.Odometry(msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "odom"), "base_link", pose, twist)
 
 
-def pass_wheels(inlet, message, now_ms):
+def pass_wheels(inlet, message, now_ms=0):
     return inlet.wheels(message, WALL_NS + now_ms * MS, MONO_NS + now_ms * MS, WALL_NS + now_ms * MS)
 
 
-def test_joints_of_a_side_are_averaged_and_their_age_is_that_of_the_stamp():
-    wheels = pass_wheels(WheelInlet(settings(**JOINTS)), joints(-20), 0)
+@pytest.fixture
+def inlet():
+    return WheelInlet(settings(**JOINTS))
+
+
+def test_joints_of_a_side_are_averaged_and_their_age_is_that_of_the_stamp_or_else_of_the_sending(inlet):
+    wheels = pass_wheels(inlet, joints(-20))
     assert wheels.angles_rad == pytest.approx((1.0, 2.0))
     assert wheels.speeds_rad_s == pytest.approx((0.5, 1.5))
     assert wheels.age_s == pytest.approx(0.020)
-
-
-def test_a_stamp_a_little_ahead_is_now():
-    assert pass_wheels(WheelInlet(settings(**JOINTS)), joints(30), 0).age_s == 0.0
-
-
-def test_a_message_without_a_stamp_counts_from_when_it_was_sent():
-    inlet = WheelInlet(settings(**JOINTS))
-    wheels = inlet.wheels(joints(0, stamp=False), WALL_NS - 30 * MS, MONO_NS, WALL_NS)
+    assert pass_wheels(inlet, joints(30)).age_s == 0.0, "a stamp a little ahead is now"
+    later_ns = WALL_NS + 100 * MS
+    wheels = inlet.wheels(joints(0, stamp=False), later_ns - 30 * MS, MONO_NS + 100 * MS, later_ns)
     assert wheels.age_s == pytest.approx(0.030)
 
 
-def test_without_velocities_the_speeds_are_those_of_the_angles():
-    inlet = WheelInlet(settings(**JOINTS))
-    assert pass_wheels(inlet, joints(0, speeds=None), 0).speeds_rad_s == (0.0, 0.0)
+def test_without_velocities_the_speeds_are_those_of_the_angles(inlet):
+    assert pass_wheels(inlet, joints(0, speeds=None)).speeds_rad_s == (0.0, 0.0)
     assert pass_wheels(inlet, joints(20, (1.1, 1.9), None), 20).speeds_rad_s == pytest.approx((5.0, -5.0))
 
 
-def test_joints_of_an_arm_alone_are_nothing_and_not_refused():
-    inlet = WheelInlet(settings(**JOINTS))
-    assert pass_wheels(inlet, joints(0, names=("arm",)), 0) is None
+def test_joints_of_an_arm_alone_are_nothing_and_not_refused(inlet):
+    assert pass_wheels(inlet, joints(0, names=("arm",))) is None
     assert not inlet.refused
 
 
@@ -102,18 +99,16 @@ def test_joints_of_an_arm_alone_are_nothing_and_not_refused():
         (msg.JointState(joints(0).header, ["fl", "fr", "rl", "rr"], [], [0.0] * 4), "or their positions"),
     ],
 )
-def test_wheels_that_cannot_be_are_refused_by_reason(message, reason):
-    inlet = WheelInlet(settings(**JOINTS))
-    assert pass_wheels(inlet, message, 0) is None
+def test_wheels_that_cannot_be_are_refused_by_reason(inlet, message, reason):
+    assert pass_wheels(inlet, message) is None
     assert [reason in text for text in inlet.refused] == [True]
     assert reason in wire.REFUSALS[inlet.why(MONO_NS)]
     assert inlet.why(MONO_NS + 2000 * MS) == 0
     assert pass_wheels(inlet, joints(40), 40) is not None, "what comes after is taken"
 
 
-def test_what_comes_out_of_order_is_refused():
-    inlet = WheelInlet(settings(**JOINTS))
-    assert pass_wheels(inlet, joints(0), 0)
+def test_what_comes_out_of_order_is_refused(inlet):
+    assert pass_wheels(inlet, joints(0))
     assert pass_wheels(inlet, joints(-10), 10) is None
     assert pass_wheels(inlet, joints(0), 10) is None
     assert list(inlet.refused) == ["its messages come out of order"]
@@ -122,20 +117,19 @@ def test_what_comes_out_of_order_is_refused():
 def test_odometry_is_turned_back_into_wheels_whatever_was_lost_between():
     """An arc of 1.5 m to the left by 3 rad: the wheels of an ideal base with a track of 0.5 m."""
     inlet, radius = WheelInlet(settings()), 0.5
-    pass_wheels(inlet, odometry(0, 3.0, -1.0, 3.0), 0)
-    for step in range(1, 31):
+    pass_wheels(inlet, odometry(0, 3.0, -1.0, 3.0))
+    for step in range(3, 31, 3):
         yaw = 3.0 + 0.1 * step
         x = 3.0 + radius * (math.sin(yaw) - math.sin(3.0))
         y = -1.0 - radius * (math.cos(yaw) - math.cos(3.0))
-        if step % 3 == 0:
-            wheels = pass_wheels(inlet, odometry(20 * step, x, y, yaw, 0.5, 1.0), 20 * step)
+        wheels = pass_wheels(inlet, odometry(20 * step, x, y, yaw, 0.5, 1.0), 20 * step)
     assert wheels.angles_rad == pytest.approx(((1.5 - 0.75) / 0.1, (1.5 + 0.75) / 0.1), rel=0.01)
     assert wheels.speeds_rad_s == pytest.approx((2.5, 7.5))
 
 
 def test_odometry_with_a_pose_that_is_none_is_refused_and_forgotten():
     inlet = WheelInlet(settings())
-    before = pass_wheels(inlet, odometry(0, 0.0, 0.0, 0.0), 0)
+    before = pass_wheels(inlet, odometry(0, 0.0, 0.0, 0.0))
     for x, yaw in ((math.nan, 0.0), (math.inf, 0.0), (0.0, math.nan), (1e308, 1.0)):
         wheels = pass_wheels(inlet, odometry(20, x, 0.0, yaw), 20)
         assert wheels is None or x == 1e308
@@ -165,77 +159,79 @@ class TestBaseEnd:
     def end(self):
         return wire.BaseEnd(settings())
 
+    @pytest.fixture
+    def enabled(self, end):
+        end.receive(0, wire.enable(True))
+        return end
+
     def test_speeds_are_said_only_after_it_was_enabled(self, end):
         assert end.receive(0, wire.speeds(0.5, 0.1)) is None
         assert end.refused_speeds == 1
         end.receive(0, wire.enable(True))
         assert end.receive(0, wire.speeds(0.5, -0.25)) == (0.5, -0.25)
 
-    def test_only_speeds_feed_it_and_its_silence_needs_a_new_enabling(self, end):
-        end.receive(0, wire.enable(True))
-        end.receive(0, wire.speeds(0.5, 0.0))
+    def test_only_speeds_feed_it_and_its_silence_needs_a_new_enabling(self, enabled):
+        enabled.receive(0, wire.speeds(0.5, 0.0))
         for now_ms in range(20, 240, 20):
-            end.receive(now_ms * MS, wire.enable(True))
-            published = end.step(now_ms * MS)
+            enabled.receive(now_ms * MS, wire.enable(True))
+            published = enabled.step(now_ms * MS)
             assert published == (None if now_ms <= 200 else (0.0, 0.0))
-        assert not end.driving
-        assert wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
-        assert end.receive(300 * MS, wire.speeds(0.5, 0.0)) is None
+        assert not enabled.driving
+        assert wire.unpack_state(enabled.state().data)[0] & wire.FELL_SILENT
+        assert enabled.receive(300 * MS, wire.speeds(0.5, 0.0)) is None
 
-    def test_speeds_in_time_keep_it_driving_and_a_new_enabling_forgets_the_silence(self, end):
-        end.receive(0, wire.enable(True))
+    def test_speeds_in_time_keep_it_driving_and_a_new_enabling_forgets_the_silence(self, enabled):
         for now_ms in range(0, 2000, 190):
-            assert end.receive(now_ms * MS, wire.speeds(0.5, 0.0)) == (0.5, 0.0)
-        end.step(3000 * MS)
-        assert wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
-        end.receive(3000 * MS, wire.enable(True))
-        assert not wire.unpack_state(end.state().data)[0] & wire.FELL_SILENT
+            assert enabled.receive(now_ms * MS, wire.speeds(0.5, 0.0)) == (0.5, 0.0)
+        enabled.step(3000 * MS)
+        assert wire.unpack_state(enabled.state().data)[0] & wire.FELL_SILENT
+        enabled.receive(3000 * MS, wire.enable(True))
+        assert not wire.unpack_state(enabled.state().data)[0] & wire.FELL_SILENT
 
-    def test_speeds_that_come_after_a_silence_are_refused_even_before_the_next_step(self, end):
-        end.receive(0, wire.enable(True))
-        assert end.receive(201 * MS, wire.speeds(0.5, 0.0)) is None
+    @pytest.mark.parametrize(
+        ("now_ms", "speeds"), [(201, (0.5, 0.0)), (0, (math.nan, 0.0)), (0, (0.0, -math.inf))], ids=str
+    )
+    def test_speeds_that_are_none_or_come_after_a_silence_are_not_said(self, enabled, now_ms, speeds):
+        """Even before the next step."""
+        assert enabled.receive(now_ms * MS, wire.speeds(*speeds)) is None
 
-    def test_after_standing_by_it_leaves_the_topic_to_others(self, end):
-        end.receive(0, wire.enable(True))
-        assert end.receive(0, wire.enable(False)) == (0.0, 0.0)
-        assert end.step(400 * MS) == (0.0, 0.0)
-        assert end.step(600 * MS) is None
+    def test_after_standing_by_it_leaves_the_topic_to_others(self, enabled):
+        assert enabled.receive(0, wire.enable(False)) == (0.0, 0.0)
+        assert enabled.step(400 * MS) == (0.0, 0.0)
+        assert enabled.step(600 * MS) is None
 
-    def test_an_estop_is_held_with_zeros_until_it_is_reset(self, end):
-        end.receive(0, wire.enable(True))
-        stop = Frame(wire.STOP, b"")
-        assert end.receive(0, stop) == (0.0, 0.0)
+    def test_an_estop_is_held_with_zeros_until_it_is_reset(self, enabled):
+        assert enabled.receive(0, Frame(wire.STOP, b"")) == (0.0, 0.0)
         for now_ms in (1000, 100_000):
-            end.receive(now_ms * MS, wire.enable(True))
-            assert end.receive(now_ms * MS, wire.speeds(0.5, 0.0)) is None
-            assert end.step(now_ms * MS) == (0.0, 0.0)
-        end.receive(100_001 * MS, Frame(wire.RESET, b""))
-        assert not end.driving
-        assert end.step(100_700 * MS) is None
+            enabled.receive(now_ms * MS, wire.enable(True))
+            assert enabled.receive(now_ms * MS, wire.speeds(0.5, 0.0)) is None
+            assert enabled.step(now_ms * MS) == (0.0, 0.0)
+        enabled.receive(100_001 * MS, Frame(wire.RESET, b""))
+        assert not enabled.driving
+        assert enabled.step(100_700 * MS) is None
 
-    def test_a_button_of_the_base_stops_it_and_keeps_it_from_being_enabled(self, end):
-        end.receive(0, wire.enable(True))
-        end.button = True
-        assert end.step(20 * MS) == (0.0, 0.0)
-        end.receive(40 * MS, wire.enable(True))
-        assert not end.driving
+    def test_a_button_of_the_base_stops_it_and_keeps_it_from_being_enabled(self, enabled):
+        enabled.button = True
+        assert enabled.step(20 * MS) == (0.0, 0.0)
+        enabled.receive(40 * MS, wire.enable(True))
+        assert not enabled.driving
 
-    def test_a_button_that_nobody_speaks_for_any_more_stops_it_and_leaves_the_topic_to_others(self, end):
-        end.receive(0, wire.enable(True))
-        end.receives_button = False
-        assert end.step(20 * MS) == (0.0, 0.0)
-        assert end.step(1000 * MS) is None
-        end.receive(1000 * MS, wire.enable(True))
-        assert not end.driving
-
-    @pytest.mark.parametrize("bad", [(math.nan, 0.0), (0.0, -math.inf)])
-    def test_speeds_that_are_none_are_not_said(self, end, bad):
-        end.receive(0, wire.enable(True))
-        assert end.receive(0, wire.speeds(*bad)) is None
+    def test_a_button_that_nobody_speaks_for_any_more_stops_it_and_leaves_the_topic_to_others(self, enabled):
+        enabled.receives_button = False
+        assert enabled.step(20 * MS) == (0.0, 0.0)
+        assert enabled.step(1000 * MS) is None
+        enabled.receive(1000 * MS, wire.enable(True))
+        assert not enabled.driving
 
 
 def packet(frame):
     return struct.pack("=IB3x8s", frame.can_id, len(frame.data), frame.data)
+
+
+@pytest.fixture
+def clients(tmp_path):
+    with closing(Clients(tmp_path / "base")) as listening:
+        yield listening
 
 
 def connected(path):
@@ -245,9 +241,9 @@ def connected(path):
     return client
 
 
-def test_clients_hear_the_bridge_and_each_other_and_a_hang_up_is_reported(tmp_path):
-    clients = Clients(tmp_path / "base")
-    one, other = connected(tmp_path / "base"), connected(tmp_path / "base")
+def test_clients_hear_the_bridge_and_each_other_and_a_hang_up_is_reported(clients):
+    path = clients._path
+    one, other = connected(path), connected(path)
     for _ in range(3):
         list(clients.receive(0.05))
     one.send(packet(wire.enable(True)))
@@ -262,57 +258,49 @@ def test_clients_hear_the_bridge_and_each_other_and_a_hang_up_is_reported(tmp_pa
     assert gone is None
     clients.close()
     other.close()
-    assert not (tmp_path / "base").exists()
+    assert not path.exists()
 
 
-def test_who_does_not_read_holds_up_nobody(tmp_path):
-    clients = Clients(tmp_path / "base")
-    deaf = connected(tmp_path / "base")
-    list(clients.receive(0.05))
-    for _ in range(5000):
-        clients.send(Frame(wire.STATE, bytes(8)))
-    assert clients.dropped > 1000
-    deaf.close()
-    clients.close()
+def test_who_does_not_read_holds_up_nobody(clients):
+    with connected(clients._path):
+        list(clients.receive(0.05))
+        for _ in range(5000):
+            clients.send(Frame(wire.STATE, bytes(8)))
+        assert clients.dropped > 1000
 
 
 def test_the_socket_of_a_bridge_that_was_killed_is_taken_over_and_a_living_ones_is_not(tmp_path):
     path = tmp_path / "base"
-    killed = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    killed.bind(str(path))
-    killed.close()
-    clients = Clients(path)
-    assert path.stat().st_mode & 0o777 == 0o600
-    with pytest.raises(InputError, match="listens there; stop it first"):
-        Clients(path)
-    clients.close()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as killed:
+        killed.bind(str(path))
+    with closing(Clients(path)):
+        assert path.stat().st_mode & 0o777 == 0o600
+        with pytest.raises(InputError, match="listens there; stop it first"):
+            Clients(path)
 
 
 class OverDds:
     """A bridge in this process, and a base beside it on the same domain; the daemon is a client."""
 
-    def __init__(self, tmp_path, stop_topic=""):
-        config = load_robot_config(robot_file(tmp_path, "ros2_base"))
-        self.settings = settings(stop_topic=stop_topic, **JOINTS)
-        number = next(DOMAINS)
-        config = msgspec.structs.replace(config, ros2=Ros2(domain=number))
-        self.clients = Clients(tmp_path / "base")
-        self.bridge = BaseBridge(config, self.settings, self.clients)
-        participant = DomainParticipant(number)
-        self.speeds = DataReader(participant, Topic(participant, "rt/cmd_vel", msg.Twist))
-        self.joints = DataWriter(participant, Topic(participant, "rt/joint_states", msg.JointState))
-        self.other = None
-        self.participant = participant
-        self.daemon = connected(tmp_path / "base")
+    def __init__(self, tmp_path, clients, stop_topic=""):
+        number, self.clients = next(DOMAINS), clients
+        config = msgspec.structs.replace(load_robot_config(robot_file(tmp_path, "ros2_base")), ros2=Ros2(domain=number))
+        bridge = BaseBridge(config, settings(stop_topic=stop_topic, **JOINTS), clients)
+        self.participant = DomainParticipant(number)
+        self.speeds = DataReader(self.participant, Topic(self.participant, "rt/cmd_vel", msg.Twist))
+        self.joints = self.writer("joint_states", msg.JointState)
+        self.daemon = connected(clients._path)
         self.ended = False
-        self.thread = threading.Thread(target=self.bridge.run, args=(lambda: self.ended,))
+        self.thread = threading.Thread(target=bridge.run, args=(lambda: self.ended,))
         self.thread.start()
+
+    def writer(self, topic, kind, qos=None):
+        return DataWriter(self.participant, Topic(self.participant, f"rt/{topic}", kind), qos)
 
     def end(self):
         self.ended = True
         self.thread.join()
         self.daemon.close()
-        self.clients.close()
 
     def send(self, *frames):
         for frame in frames:
@@ -338,8 +326,8 @@ class OverDds:
 
 
 @pytest.fixture(params=[""])
-def over_dds(tmp_path, request):
-    made = OverDds(tmp_path, request.param)
+def over_dds(tmp_path, clients, request):
+    made = OverDds(tmp_path, clients, request.param)
     yield made
     made.end()
 
@@ -375,17 +363,6 @@ def test_over_dds_the_button_and_the_daemons_end_stop_the_base(over_dds):
     over_dds.until(lambda flags: not flags & (wire.DRIVING | wire.FELL_SILENT))
 
 
-def refused(tmp_path, old, new, message):
-    file = robot_file(tmp_path, find_driver("ros2_base").name)
-    text = file.read_text(encoding="utf-8")
-    assert old in text
-    file.write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(InputError, match=message) as caught:
-        run_base_bridge(file)
-    assert str(caught.value).startswith(str(file))
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -397,18 +374,20 @@ def refused(tmp_path, old, new, message):
         ("watchdog_s = 0.5", "watchdog_s = 0.5\nnodes = [3, 5]", r"link\.nodes: belongs to the driver odrive"),
         ('interface = "unixcan"', 'interface = "socketcan"', r'link\.interface: .*; write "unixcan"'),
         ("ros2_base", "agilex", "watchdog_s"),
+        ("CHANNEL", "OPEN", r"link\.channel: .*others can write to it; write a path"),
     ],
 )
-def test_what_robot_toml_lacks_is_one_line(tmp_path, old, new, message):
-    refused(tmp_path, old, new, message)
-
-
-def test_a_socket_that_others_could_have_placed_is_refused(tmp_path):
-    (tmp_path / "open").mkdir()
-    (tmp_path / "open").chmod(0o777)
-    file = robot_file(tmp_path, find_driver("ros2_base").name)
-    channel = load_robot_config(file).link.channel
-    text = file.read_text(encoding="utf-8").replace(channel, str(tmp_path / "open" / "base"))
-    file.write_text(text, encoding="utf-8")
-    with pytest.raises(InputError, match=r"link\.channel: .*others can write to it; write a path"):
+def test_what_robot_toml_lacks_and_a_socket_that_others_could_have_placed_are_refused_in_one_line(
+    tmp_path, old, new, message
+):
+    file, open_folder = robot_file(tmp_path, find_driver("ros2_base").name), tmp_path / "open"
+    open_folder.mkdir()
+    open_folder.chmod(0o777)
+    text = file.read_text(encoding="utf-8")
+    old = old.replace("CHANNEL", load_robot_config(file).link.channel)
+    assert old in text
+    file.write_text(text.replace(old, new.replace("OPEN", str(open_folder / "base"))), encoding="utf-8")
+    with pytest.raises(InputError, match=message) as caught:
         run_base_bridge(file)
+    assert str(caught.value).startswith(str(file))
+    assert "\n" not in str(caught.value)

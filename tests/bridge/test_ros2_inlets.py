@@ -32,6 +32,12 @@ MONO_NS, WALL_NS = 50_000_000_000, 1_800_000_000_000_000_000
 MS = 1_000_000
 
 
+def transform(parent, child, stamp_ns, x, y=0.0, yaw=0.0):
+    turned = msg.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+    header = msg.Header(msg.stamp_of(stamp_ns), parent)
+    return msg.TFMessage([msg.TransformStamped(header, child, msg.Transform(msg.Vector3(x, y, 0.0), turned))])
+
+
 def pose_message(age_ns=20 * MS, frame="map", x=1.0, yaw=2.5, kind=msg.PoseStamped, covariance=None):
     pose = msg.RosPose(msg.Point(x, -2.0, 0.3), msg.Quaternion(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)))
     header = msg.Header(msg.stamp_of(WALL_NS - age_ns), frame)
@@ -39,6 +45,11 @@ def pose_message(age_ns=20 * MS, frame="map", x=1.0, yaw=2.5, kind=msg.PoseStamp
         return kind(header, pose)
     spread = msg.PoseWithCovariance(pose, covariance or [0.0] * 36)
     return kind(header, spread) if kind is msg.PoseWithCovarianceStamped else kind(header, "base_link", spread)
+
+
+@pytest.fixture
+def poses():
+    return PoseInlet(PoseInput())
 
 
 def covariance(xx, yy, tt):
@@ -58,9 +69,9 @@ def test_a_pose_reaches_the_daemon_at_its_own_time(kind):
     assert (pose.position_std_m, pose.yaw_std_rad) == (0.03, 0.04)
 
 
-def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position():
+def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position(poses):
     message = pose_message(kind=msg.Odometry, covariance=covariance(0.01, 0.04, 0.0009))
-    pose = pose_of(PoseInlet(PoseInput()).datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)
+    pose = pose_of(poses.datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)
     assert (pose.position_std_m, pose.yaw_std_rad) == (pytest.approx(0.2), pytest.approx(0.03))
 
 
@@ -83,30 +94,28 @@ def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position():
         ),
     ],
 )
-def test_what_is_no_pose_is_refused_by_its_reason(message, expected):
-    inlet = PoseInlet(PoseInput())
-    assert inlet.datagram(message, WALL_NS, MONO_NS, WALL_NS) is None
-    assert [expected in reason for reason in inlet.refused] == [True]
-    assert expected in inlet.why
+def test_what_is_no_pose_is_refused_by_its_reason(poses, message, expected):
+    assert poses.datagram(message, WALL_NS, MONO_NS, WALL_NS) is None
+    assert [expected in reason for reason in poses.refused] == [True]
+    assert expected in poses.why
     # One that is well is still taken after it.
-    assert inlet.datagram(pose_message(age_ns=10 * MS), 0, MONO_NS, WALL_NS) is not None
-    assert inlet.why == ""
+    assert poses.datagram(pose_message(age_ns=10 * MS), 0, MONO_NS, WALL_NS) is not None
+    assert poses.why == ""
 
 
-def test_a_pose_without_a_stamp_has_the_time_at_which_it_was_sent():
+def test_a_pose_without_a_stamp_has_the_time_at_which_it_was_sent(poses):
     message = pose_message()
     message.header.stamp = msg.Time()
-    sent = PoseInlet(PoseInput()).datagram(message, WALL_NS - 70 * MS, MONO_NS, WALL_NS)
+    sent = poses.datagram(message, WALL_NS - 70 * MS, MONO_NS, WALL_NS)
     assert pose_of(sent, MONO_NS).t_ns == MONO_NS - 70 * MS
     assert PoseInlet(PoseInput()).datagram(message, WALL_NS - 2000 * MS, MONO_NS, WALL_NS) is None
 
 
-def test_of_a_flood_and_of_repetitions_little_is_passed_on():
-    inlet = PoseInlet(PoseInput())
+def test_of_a_flood_and_of_repetitions_little_is_passed_on(poses):
     now = range(0, 100 * MS, MS // 10)
-    passed = [inlet.datagram(pose_message(20 * MS - t), 0, MONO_NS + t, WALL_NS + t) for t in now]
+    passed = [poses.datagram(pose_message(20 * MS - t), 0, MONO_NS + t, WALL_NS + t) for t in now]
     assert 20 <= sum(one is not None for one in passed) <= 26
-    assert inlet.datagram(pose_message(20 * MS), 0, MONO_NS + 200 * MS, WALL_NS + 200 * MS) is None
+    assert poses.datagram(pose_message(20 * MS), 0, MONO_NS + 200 * MS, WALL_NS + 200 * MS) is None
 
 
 PARAMETERS = OdometryParameters(0.1, 0.8, 0.0)
@@ -125,18 +134,29 @@ def twist(speed, turn):
     return msg.Twist(msg.Vector3(speed, 0.0, 0.0), msg.Vector3(0.0, 0.0, turn))
 
 
-def inlet_that_may_drive():
-    inlet = SpeedInlet(ROBOT, DRIVE, PARAMETERS)
-    assert inlet.request(twist(0.0, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
-    assert inlet.permit(MONO_NS) is None
+def request_speed(inlet, speed, turn=0.0, now_ns=0, age_ns=0):
+    return inlet.request(twist(speed, turn), WALL_NS + now_ns - age_ns, MONO_NS + now_ns, WALL_NS + now_ns)
+
+
+@pytest.fixture
+def fresh():
+    """An inlet of speeds, for which nobody has asked to arm."""
+    return SpeedInlet(ROBOT, DRIVE, PARAMETERS)
+
+
+@pytest.fixture
+def permitted(fresh):
+    """An inlet whose speeds may drive, as arming was asked for while they came."""
+    assert request_speed(fresh, 0.0)["held"] is False
+    assert fresh.permit(MONO_NS) is None
     for _ in range(2):
-        assert inlet.request(twist(0.0, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
-    return inlet
+        assert request_speed(fresh, 0.0)["held"] is False
+    return fresh
 
 
 @pytest.mark.parametrize(("speed", "turn"), [(0.2, 0.0), (0.1, 0.3), (-0.2, -0.2), (0.0, 0.4)])
-def test_a_speed_becomes_the_wheel_speeds_that_make_it(speed, turn):
-    request = inlet_that_may_drive().request(twist(speed, turn), WALL_NS, MONO_NS, WALL_NS)
+def test_a_speed_becomes_the_wheel_speeds_that_make_it(permitted, speed, turn):
+    request = request_speed(permitted, speed, turn)
     del request["do"]
     steering = steering_from(request)
     left, right = wheel_speeds(steering.forward, steering.left * 0.6, 5.0)
@@ -144,55 +164,49 @@ def test_a_speed_becomes_the_wheel_speeds_that_make_it(speed, turn):
     assert 0.1 * (right - left) / 0.8 == pytest.approx(turn)
 
 
-def test_what_is_too_fast_is_slowed_down_on_the_same_curve():
-    request = inlet_that_may_drive().request(twist(3.0, 3.0), WALL_NS, MONO_NS, WALL_NS)
+def test_what_is_too_fast_is_slowed_down_on_the_same_curve(permitted):
+    request = request_speed(permitted, 3.0, 3.0)
     left, right = wheel_speeds(request["forward"], request["left"] * 0.6, 5.0)
     assert max(abs(left), abs(right)) <= 5.0 + 1e-9
     assert 0.1 * (right - left) / 0.8 == pytest.approx(0.1 * (left + right) / 2)
 
 
-def test_speeds_drive_only_once_arming_was_asked_for_while_they_came():
-    inlet = SpeedInlet(ROBOT, DRIVE, PARAMETERS)
-    assert "no speeds" in inlet.permit(MONO_NS)
+def test_speeds_drive_only_once_arming_was_asked_for_while_they_came(fresh):
+    assert "no speeds" in fresh.permit(MONO_NS)
     for _ in range(5):
-        assert inlet.request(twist(0.1, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
+        assert request_speed(fresh, 0.1)["held"] is False
 
 
-def test_a_silence_takes_the_permission_away():
-    inlet = inlet_that_may_drive()
-    assert inlet.request(twist(0.1, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is True
-    later = 201 * MS
+def test_a_silence_takes_the_permission_away(permitted):
+    assert request_speed(permitted, 0.1)["held"] is True
     for _ in range(5):
-        assert inlet.request(twist(0.1, 0.0), WALL_NS + later, MONO_NS + later, WALL_NS + later)["held"] is False
+        assert request_speed(permitted, 0.1, now_ns=201 * MS)["held"] is False
 
 
-@pytest.mark.parametrize("message", [twist(math.nan, 0.0), twist(0.1, math.inf)])
-def test_a_speed_that_is_none_takes_it_away_too(message):
-    inlet = inlet_that_may_drive()
-    assert inlet.request(message, WALL_NS, MONO_NS, WALL_NS) is None
-    assert inlet.request(twist(0.1, 0.0), WALL_NS, MONO_NS, WALL_NS)["held"] is False
+@pytest.mark.parametrize(("speed", "turn"), [(math.nan, 0.0), (0.1, math.inf)])
+def test_a_speed_that_is_none_takes_it_away_too(permitted, speed, turn):
+    assert request_speed(permitted, speed, turn) is None
+    assert request_speed(permitted, 0.1)["held"] is False
 
 
 @pytest.mark.parametrize("age", [210 * MS, -60 * MS, 10_000 * MS])
-def test_an_old_speed_or_one_by_another_clock_is_refused(age):
-    inlet = inlet_that_may_drive()
-    assert inlet.request(twist(0.1, 0.0), WALL_NS - age, MONO_NS, WALL_NS) is None
+def test_an_old_speed_or_one_by_another_clock_is_refused(permitted, age):
+    assert request_speed(permitted, 0.1, age_ns=age) is None
     stamped = msg.TwistStamped(msg.Header(msg.stamp_of(WALL_NS - age)), twist(0.1, 0.0))
-    assert inlet.request(stamped, WALL_NS, MONO_NS, WALL_NS) is None
+    assert permitted.request(stamped, WALL_NS, MONO_NS, WALL_NS) is None
 
 
-def test_the_daemons_deadman_counts_from_when_the_speed_was_sent():
-    inlet, page = inlet_that_may_drive(), PageSource(5.0, 0.6)
-    view = RobotView(State.READY, False)
+def test_the_daemons_deadman_counts_from_when_the_speed_was_sent(permitted):
+    page, view = PageSource(5.0, 0.6), RobotView(State.READY, False)
 
-    def steer(now_ns, held, stamp_ns):
+    def steer(held, stamp_ns):
         command = {"forward": 0.1, "left": 0.0, "held": held, "stamp": str(stamp_ns)}
-        return page.steer(now_ns, 1, steering_from(command))
+        return page.steer(MONO_NS, 1, steering_from(command))
 
-    steer(MONO_NS, False, MONO_NS)
-    request = inlet.request(twist(0.1, 0.0), WALL_NS - 150 * MS, MONO_NS, WALL_NS)
+    steer(False, MONO_NS)
+    request = request_speed(permitted, 0.1, age_ns=150 * MS)
     assert request["held"]
-    assert steer(MONO_NS, True, int(request["stamp"])) is None
+    assert steer(True, int(request["stamp"])) is None
     assert MONO_NS - page.poll(MONO_NS, view).t_ns == 150 * MS
 
 
@@ -288,11 +302,8 @@ class TestTransforms:
 
     def poses_of(self, inlet, at_ms, parent, child, place, static=False, now_ms=None):
         """The poses that a transform at a time brings."""
-        turned = msg.Quaternion(0.0, 0.0, math.sin(place[2] / 2), math.cos(place[2] / 2))
-        header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), parent)
-        one = msg.TransformStamped(header, child, msg.Transform(msg.Vector3(place[0], place[1], 0.0), turned))
         now_ns = WALL_NS + (at_ms if now_ms is None else now_ms) * MS
-        return list(inlet.poses(msg.TFMessage([one]), now_ns, now_ns, static=static))
+        return list(inlet.poses(transform(parent, child, WALL_NS + at_ms * MS, *place), now_ns, now_ns, static=static))
 
     @staticmethod
     def place(pose):
@@ -332,14 +343,12 @@ class TestTransforms:
             poses += self.poses_of(inlet, at_ms + 5, "map", "odom", (1.0 if at_ms < 2000 else 2.0, 0.0, 0.0))
         assert [round(math.sqrt(pose.pose.covariance[0]) / 0.03) for pose in poses] == [1, 3, 3, 3, 1, 3]
 
-    def test_a_single_edge_that_moves_brings_each(self):
+    def test_a_single_edge_that_moves_brings_each_and_a_static_one_none(self):
+        inlet = TransformInlet(PoseInput(), "base_link")
+        assert not self.poses_of(inlet, 0, "map", "base_link", (1.0, 0.0, 0.0), static=True)
         inlet = TransformInlet(PoseInput(), "base_link")
         poses = [self.poses_of(inlet, 20 * k, "map", "base_link", (1.0, 0.0, 0.0)) for k in range(5)]
         assert [len(each) for each in poses] == [1] * 5
-
-    def test_static_transforms_alone_are_no_pose(self):
-        inlet = TransformInlet(PoseInput(), "base_link")
-        assert not self.poses_of(inlet, 0, "map", "base_link", (1.0, 0.0, 0.0), static=True)
 
     @pytest.mark.parametrize(
         ("at_ms", "place", "reason"),
@@ -362,10 +371,9 @@ class TestTransforms:
 
     def test_of_two_publishers_of_one_edge_the_first_counts_and_the_other_is_named(self, inlet):
         def poses_by(at_ms, x, publisher):
-            header = msg.Header(msg.stamp_of(WALL_NS + at_ms * MS), "map")
-            place = msg.Transform(msg.Vector3(x, 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0))
-            message = msg.TFMessage([msg.TransformStamped(header, "odom", place)])
-            return list(inlet.poses(message, 0, WALL_NS + at_ms * MS, static=False, publisher=publisher))
+            now_ns = WALL_NS + at_ms * MS
+            message = transform("map", "odom", now_ns, x)
+            return list(inlet.poses(message, 0, now_ns, static=False, publisher=publisher))
 
         for at_ms in range(0, 500, 50):
             self.poses_of(inlet, at_ms, "odom", "base_link", (1.0, 0.0, 0.0))
@@ -394,12 +402,9 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
     received, deadline = [], time.monotonic() + 100.0
     while not received and time.monotonic() < deadline:
         now_ns = time.time_ns()
-        for parent, child, x, ahead_ns in (("odom", "base_link", 2.0, 0), ("map", "odom", 3.0, 200 * MS)):
-            place = msg.Transform(
-                msg.Vector3(x + 1e-12 * (now_ns % 1000), 0.0, 0.0), msg.Quaternion(0.0, 0.0, 0.0, 1.0)
-            )
-            header = msg.Header(msg.stamp_of(now_ns + ahead_ns), parent)
-            bridge._publish("/tf", msg.TFMessage([msg.TransformStamped(header, child, place)]))
+        moved = 1e-12 * (now_ns % 1000)
+        bridge._publish("/tf", transform("odom", "base_link", now_ns, 2.0 + moved))
+        bridge._publish("/tf", transform("map", "odom", now_ns + 200 * MS, 3.0 + moved))
         received = daemon.receive(time.monotonic_ns(), ())
         time.sleep(0.01)
     ended.append(True)
@@ -416,28 +421,25 @@ def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the
 )  # fmt: skip
 @pytest.mark.parametrize("kind", [msg.PoseWithCovarianceStamped, msg.Odometry])
 def test_a_heading_whose_covariance_says_unknown_is_left_out_and_the_position_is_passed_on(
-    kind, yaw, variance, has_heading
+    poses, kind, yaw, variance, has_heading
 ):
-    inlet = PoseInlet(PoseInput())
     message = pose_message(yaw=yaw, kind=kind, covariance=covariance(0.01, 0.01, variance))
-    pose = pose_of(inlet.datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)
+    pose = pose_of(poses.datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)
     assert (pose.x_m, pose.y_m, pose.has_heading) == (1.0, -2.0, has_heading)
-    assert inlet.without_heading == (not has_heading)
+    assert poses.without_heading == (not has_heading)
 
 
-def test_of_two_publishers_on_the_topic_the_first_counts_until_it_is_silent_and_the_other_is_named():
-    inlet = PoseInlet(PoseInput())
-
+def test_of_two_publishers_on_the_topic_the_first_counts_until_it_is_silent_and_the_other_is_named(poses):
     def passes(at_ms, publisher):
         t = at_ms * MS
-        return inlet.datagram(pose_message(20 * MS - t), 0, MONO_NS + t, WALL_NS + t, publisher) is not None
+        return poses.datagram(pose_message(20 * MS - t), 0, MONO_NS + t, WALL_NS + t, publisher) is not None
 
     assert [passes(40 * k, "publisher a") for k in range(3)] == [True] * 3
     assert [passes(90 + k, "publisher b") for k in range(5)] == [False] * 5
-    assert inlet.refused["of a second publisher on the topic"] == 5
-    (warning,) = inlet.new_messages()
+    assert poses.refused["of a second publisher on the topic"] == 5
+    (warning,) = poses.new_messages()
     assert warning.startswith("publisher b sends poses while publisher a does: not used")
     assert "is used until it has sent nothing for 2 s" in warning
     assert passes(120, "publisher a")
     assert passes(2200, "publisher b")
-    assert inlet.new_messages() == ["poses now come from publisher b; publisher a has sent nothing for 2.1 s"]
+    assert poses.new_messages() == ["poses now come from publisher b; publisher a has sent nothing for 2.1 s"]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,14 +11,13 @@ from disco_hw.control import NoValidControl, Sampler, pendulum
 from disco_hw.control.black_box import BlackBoxDisco
 from disco_hw.control.parameter_points import sampled_points, unscented_points
 from disco_hw.control.pendulum import PAPER_SAMPLER
-from disco_hw.model import load_model
 from disco_hw.model import plain as physics
 from disco_hw.tasks.circle import CircleCost
 from tests.control import oracle
 from tests.control.torch_models import circle_cost, pendulum_cost, pendulum_transition, skid_steer_transition
 from tests.tasks import costs
+from tests.tasks.drives import MODEL
 
-MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
 POINTS, WEIGHTS = unscented_points(MODEL, 1.0)
 STEP_S, T, K = 0.1, 20, 64
 SAMPLER = Sampler(samples=K, horizon=T)
@@ -152,26 +150,19 @@ def test_negative_weights_have_a_meaning_for_the_mean():
     assert np.isfinite(skid_steer(weights=NEGATIVE).plan(START)).all()
 
 
-@pytest.mark.parametrize("name", ["transition", "stage_cost", "terminal_cost"])
-def test_results_of_another_shape_are_refused(name):
-    given = {
-        "transition": skid_steer_transition(STEP_S),
-        "stage_cost": circle_cost(CircleCost()),
-        "terminal_cost": None,
-    }
-    wrong = {
-        "transition": lambda state, control, theta: state[:1],
-        "stage_cost": lambda state, t: state[..., 0].mean(),
-        "terminal_cost": lambda state: state[..., :1],
-    }
-    disco = BlackBoxDisco(**{**given, name: wrong[name]}, theta=POINTS, weights=WEIGHTS, controls=2, sampler=SAMPLER)
-    with pytest.raises(ValueError, match=rf"{name} returned \(.*\); must return a tensor of shape \(7, 64"):
-        disco.plan(START)
-
-
-def test_a_cost_that_is_no_tensor_is_refused():
-    disco = BlackBoxDisco(skid_steer_transition(STEP_S), lambda state, t: 0.0, POINTS, WEIGHTS, 2, SAMPLER)
-    with pytest.raises(ValueError, match=r"stage_cost returned float; must return a tensor of shape \(7, 64\)"):
+@pytest.mark.parametrize(
+    ("name", "wrong", "returned"),
+    [
+        ("transition", lambda state, control, theta: state[:1], r"\(.*\); must return a tensor of shape \(7, 64"),
+        ("stage_cost", lambda state, t: state[..., 0].mean(), r"\(.*\); must return a tensor of shape \(7, 64"),
+        ("stage_cost", lambda state, t: 0.0, r"float; must return a tensor of shape \(7, 64\)"),
+        ("terminal_cost", lambda state: state[..., :1], r"\(.*\); must return a tensor of shape \(7, 64"),
+    ],
+)
+def test_what_is_no_tensor_of_the_right_shape_is_refused(name, wrong, returned):
+    given = {"transition": skid_steer_transition(STEP_S), "stage_cost": circle_cost(CircleCost())}
+    disco = BlackBoxDisco(**{**given, name: wrong}, theta=POINTS, weights=WEIGHTS, controls=2, sampler=SAMPLER)
+    with pytest.raises(ValueError, match=f"{name} returned {returned}"):
         disco.plan(START)
 
 

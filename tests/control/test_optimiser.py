@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.interpolate import BSpline
 
 from disco_hw.control.kernel import BLOCK
 from disco_hw.control.kernel.step import LEAST, NOMINAL, TEMPERATURE, VALID
-from disco_hw.control.optimiser import FIRST_TEMPERATURE, Optimiser
+from disco_hw.control.optimiser import FIRST_TEMPERATURE, Optimiser, spline_basis
 from disco_hw.control.pendulum import LARGEST_TORQUE_NM, PAPER_SAMPLER, STEP_S, PendulumTerms
 
 T, SAMPLES = 20, 100
@@ -138,3 +139,15 @@ def test_noise_as_drawn_moves_the_plan_beyond_what_the_bounds_let_through():
         found.step(0.0, 1.0, (0.0,), pendulum(), WEIGHTS)
         plans[update_from] = np.abs(np.diff(found.nominal()[:, 0])).max()
     assert plans["applied"] <= 0.05 + 1e-6 < plans["drawn"]
+
+
+@pytest.mark.parametrize(("knots", "horizon"), [(4, 2), (5, 50), (8, 50), (8, 7), (30, 50)])
+def test_the_spline_basis_is_that_of_a_clamped_cubic_spline(knots, horizon):
+    first, weights = spline_basis(knots, horizon)
+    assert first.min() >= 0
+    assert first.max() <= knots - 4
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    control = np.random.default_rng(0).standard_normal(knots)
+    vector = np.r_[0, 0, 0, np.linspace(0, 1, knots - 2), 1, 1, 1]
+    expected = BSpline(vector, control, 3)((np.arange(horizon) + 0.5) / horizon)
+    np.testing.assert_allclose((weights * control[first[:, None] + np.arange(4)]).sum(axis=1), expected, atol=1e-12)

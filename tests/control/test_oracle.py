@@ -13,6 +13,10 @@ from disco_hw.tasks.timed_path import TimedPathCost
 from tests.control import oracle
 from tests.tasks.costs import circle_cost, path_along, path_cost, timed_path_cost
 
+LINE = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.0, 10.0]))
+BY_LENGTH, BY_TIME = path_cost(path_along(LINE, 0.2), 0.0, 0.1), timed_path_cost(TimedPathCost(LINE), 0.0, 0.1)
+MOVING, STILL = 0.02 * np.arange(6)[:, None], np.zeros((6, 1))
+"""Five steps of 0.1 s along the line at 0.2 m/s, and of a robot at rest."""
 THETA = {"wheel_radius_m": 0.1, "axial_distance_m": 0.5, "x_icr_m": 0.0}
 
 
@@ -52,46 +56,35 @@ def test_weights_and_temperature():
 
 
 def test_following_a_path_costs_nothing_and_standing_costs_the_speed():
-    line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.0, 10.0]))
-    moving = 0.02 * np.arange(6)[:, None]
-    still = np.zeros((6, 1))
-    by_length = path_cost(path_along(line, 0.2), 0.0, 0.1)
-    by_time = timed_path_cost(TimedPathCost(line), 0.0, 0.1)
-    for cost in (by_length, by_time):
-        assert cost(moving, still, still, np.full((5, 1), 0.2))[0] == pytest.approx(0.0, abs=1e-9)
+    for cost in (BY_LENGTH, BY_TIME):
+        assert cost(MOVING, STILL, STILL, np.full((5, 1), 0.2))[0] == pytest.approx(0.0, abs=1e-9)
     # As dear as being STANDING_M beside it.
-    assert by_length(still, still, still, still[1:])[0] == pytest.approx(5 * 0.2)
-    assert by_time(still, still, still, still[1:])[0] == pytest.approx(0.02 * 15)
+    assert BY_LENGTH(STILL, STILL, STILL, STILL[1:])[0] == pytest.approx(5 * 0.2)
+    assert BY_TIME(STILL, STILL, STILL, STILL[1:])[0] == pytest.approx(0.02 * 15)
 
 
 def test_going_backwards_costs_the_whole_speed_and_facing():
-    line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]), np.array([0.0, 10.0]))
-    moving, still = 0.02 * np.arange(6)[:, None], np.zeros((6, 1))
     back, across = np.full((6, 1), math.pi), np.full((6, 1), 0.5 * math.pi)
-    by_length = path_cost(path_along(line, 0.2), 0.0, 0.1)
-    by_time = timed_path_cost(TimedPathCost(line), 0.0, 0.1)
-    assert by_length(moving, still, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * (0.2 + 0.6))
+    assert BY_LENGTH(MOVING, STILL, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * (0.2 + 0.6))
     # Sideways, as in sliding round a corner, is progress as long as the robot does not drive backwards.
-    assert by_length(moving, still, across, still[1:])[0] == pytest.approx(0.0, abs=1e-9)
-    assert by_length(moving, still, across, np.full((5, 1), -0.1))[0] == pytest.approx(5 * 0.1)
-    assert by_time(moving, still, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * 0.6)
+    assert BY_LENGTH(MOVING, STILL, across, STILL[1:])[0] == pytest.approx(0.0, abs=1e-9)
+    assert BY_LENGTH(MOVING, STILL, across, np.full((5, 1), -0.1))[0] == pytest.approx(5 * 0.1)
+    assert BY_TIME(MOVING, STILL, back, np.full((5, 1), -0.2))[0] == pytest.approx(5 * 0.6)
 
 
 def test_the_last_distance_of_a_path_counts_for_a_second_more():
-    line = Waypoints(np.array([[0.0, 0.0], [2.0, 0.0]]))
-    beside, still = np.full((6, 1), 0.3), np.zeros((6, 1))
-    cost = path_cost(path_along(line, 0.2), 50.0, 0.1)
+    beside = np.full((6, 1), 0.3)
+    cost = path_cost(path_along(LINE, 0.2), 50.0, 0.1)
     expected = 5 * math.hypot(0.3, 0.2) + 10 * 0.3
-    assert cost(np.ones((6, 1)), beside, still, still[1:])[0] == pytest.approx(expected)
+    assert cost(np.ones((6, 1)), beside, STILL, STILL[1:])[0] == pytest.approx(expected)
 
 
 def test_a_place_does_not_leave_its_piece():
     there_and_back = path_along(Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])), 0.2)
-    past = 0.98 + 0.02 * np.arange(6)[:, None]
-    still = np.zeros((6, 1))
+    past = 0.98 + MOVING
     cost = path_cost(there_and_back, 49.0, 0.1)
     # It is wanted to stop at the piece's end, so going on costs more and more: distance and, as a speed, all of it.
-    got = cost(past, still, still, np.full((5, 1), 0.2))[0]
+    got = cost(past, STILL, STILL, np.full((5, 1), 0.2))[0]
     beyond = 0.02 * np.arange(5)
     wanted = np.array([0.02, *np.zeros(4)])
     along = np.array([0.2, *np.minimum(beyond[1:] / 0.1, 0.2)])

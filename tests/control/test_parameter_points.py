@@ -24,14 +24,16 @@ STEP_S = 0.1
 BIAS = EffectSetting("heading_bias", {"bias_rad": 0.1})
 
 
+def assert_moments_of(belief, model, points, weights):
+    """Over the believed parameters the points have the belief's mean and covariance."""
+    of_belief = points[:, [model.parameter_names.index(name) for name in belief.names]]
+    np.testing.assert_allclose(weights @ of_belief, belief.mean())
+    offsets = of_belief - belief.mean()
+    np.testing.assert_allclose(np.einsum("l,li,lj->ij", weights, offsets, offsets), belief.covariance(), atol=1e-12)
+
+
 def test_unscented_points_carry_the_beliefs_moments_over_all_parameters():
-    points, weights = unscented_points(PAPER, 1.0)
-    order = [PAPER.parameter_names.index(name) for name in PAPER.belief.names]
-    np.testing.assert_allclose((weights @ points)[order], PAPER.belief.mean())
-    offsets = points[:, order] - PAPER.belief.mean()
-    np.testing.assert_allclose(
-        np.einsum("l,li,lj->ij", weights, offsets, offsets), PAPER.belief.covariance(), atol=1e-12
-    )
+    assert_moments_of(PAPER.belief, PAPER, *unscented_points(PAPER, 1.0))
 
 
 def test_two_points_differ_from_the_mean_in_x_icr_alone_and_two_in_scale_too():
@@ -65,9 +67,7 @@ def test_effects_on_the_wheels_leave_the_scale_alone_and_believed_ones_keep_thei
     found = equivalent_points(model, points, STEP_S, 2)
     assert np.sum(found[:, 0] >= 0) == 1
     np.testing.assert_array_equal(points[found[0], 3], np.full(4, points[0, 3]))
-    order = [model.parameter_names.index(name) for name in names]
-    offsets = points[:, order] - belief.mean()
-    np.testing.assert_allclose(np.einsum("l,li,lj->ij", weights, offsets, offsets), belief.covariance(), atol=1e-12)
+    assert_moments_of(belief, model, points, weights)
 
 
 def test_without_twins_there_are_none():

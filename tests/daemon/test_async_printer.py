@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import pty
@@ -23,38 +24,36 @@ def pipe():
     ends = os.pipe()
     yield ends
     for end in ends:
-        try:
+        with contextlib.suppress(OSError):
             os.close(end)
-        except OSError:
-            continue
 
 
 def printed_unread(descriptor):
-    """A teller, and whether telling it ten sentences ended although nobody reads."""
-    teller = AsyncPrinter(descriptor, line_of, most=4)
-    printing = threading.Thread(target=lambda: [teller("event", str(k)) for k in range(10)], daemon=True)
+    """Print ten sentences that nobody reads, which must end all the same; returns the printer."""
+    printer = AsyncPrinter(descriptor, line_of, most=4)
+    printing = threading.Thread(target=lambda: [printer("event", str(k)) for k in range(10)], daemon=True)
     printing.start()
     printing.join(10.0)
-    return teller, not printing.is_alive()
+    assert not printing.is_alive(), "it is held up"
+    return printer
 
 
 def test_everything_is_written_in_order_by_the_end(pipe):
-    teller = AsyncPrinter(pipe[1], line_of)
+    printer = AsyncPrinter(pipe[1], line_of)
     for k in range(200):
-        teller("event", f"{k} \udcff")
-    teller.close()
-    teller.close()
+        printer("event", f"{k} \udcff")
+    printer.close()
+    printer.close()
     assert os.read(pipe[0], 65536) == b"".join(b"event: %d \xff\n" % k for k in range(200))
 
 
 def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
     master, slave = pty.openpty()
     termios.tcflow(slave, termios.TCOOFF)
-    teller, reported = printed_unread(slave)
-    assert reported
-    teller.close(0.1)
+    printer = printed_unread(slave)
+    printer.close(0.1)
     termios.tcflow(slave, termios.TCOON)
-    teller.close(10.0)
+    printer.close(10.0)
     output = b""
     # A terminal hands on what was written to it piece by piece.
     while b"messages are missing here" not in output and select.select([master], [], [], 10.0)[0]:
@@ -68,14 +67,11 @@ def test_a_terminal_that_is_held_by_ctrl_s_holds_nobody_up():
 
 def test_a_pipe_that_nobody_reads_holds_nobody_up(pipe):
     os.write(pipe[1], b"x" * fcntl.fcntl(pipe[1], fcntl.F_GETPIPE_SZ))
-    teller, reported = printed_unread(pipe[1])
-    assert reported
-    assert teller.dropped >= 5
+    assert printed_unread(pipe[1]).dropped >= 5
 
 
 def test_a_reader_that_has_gone_is_no_error(pipe):
     os.close(pipe[0])
-    teller, reported = printed_unread(pipe[1])
-    assert reported
-    teller.close()
-    assert not teller._thread.is_alive()
+    printer = printed_unread(pipe[1])
+    printer.close()
+    assert not printer._thread.is_alive()

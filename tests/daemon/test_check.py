@@ -18,7 +18,7 @@ from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
 from drivers.types import Frame, OutgoingFrame, PoseSample
 from firmware_protocol.status_codes import FAULTS
-from tests.daemon.test_control_client import Daemon
+from tests.daemon.control_daemon import ControlDaemon
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot
 from tests.runtime.simulated import ROBOT_FILE
@@ -59,35 +59,37 @@ def brief(monkeypatch):
     monkeypatch.setattr(check, "_SETTLED_S", 0.6)
 
 
-@pytest.mark.parametrize("key", [b"", KEY])
-def test_a_robot_that_takes_what_it_is_sent(key):
-    found = check._query_robot(RobotInTime(key), create_driver(None, None, key or None), RobotPoses())
-    assert check._hearing_check(found).level is Level.OK
+def query(robot, key=b"", poses=None):
+    """Ask a robot with the host's key for all that a check needs."""
+    return check._query_robot(robot, create_driver(None, None, key or None), poses or RobotPoses())
 
 
-def test_a_key_that_is_not_the_robots_fails():
-    found = check._query_robot(RobotInTime(KEY), create_driver(None, None, KEY[::-1]), RobotPoses())
-    result = check._hearing_check(found)
-    assert result.level is Level.FAIL
-    assert "link.key_file" in result.text
+@pytest.mark.parametrize(
+    ("robot_key", "key", "disturb", "level", "text"),
+    [
+        (b"", b"", None, Level.OK, ""),
+        (KEY, KEY, None, Level.OK, ""),
+        (KEY, KEY[::-1], None, Level.FAIL, "link.key_file"),
+        (b"", b"", Frame(0x101, bytes(8)), Level.WARNING, "checksum"),
+    ],
+    ids=["no key", "the robot's key", "another key", "frames of a stranger"],
+)
+def test_a_robot_must_take_what_it_is_sent(robot_key, key, disturb, level, text):
+    robot = RobotInTime(robot_key)
+    robot.disturb = disturb
+    result = check._hearing_check(query(robot, key))
+    assert result.level is level
+    assert text in result.text
 
 
 def test_a_fault_that_does_not_latch_fails_with_what_to_do():
     robot = RobotInTime(b"")
     robot.robot.inputs["right_temperature_c"] = 100.0
-    firmware = check._firmware_check(check._query_robot(robot, create_driver(None), RobotPoses()), has_clock=True)
+    firmware = check._firmware_check(query(robot), has_clock=True)
     assert (firmware.level, firmware.text) == (
         Level.FAIL,
         "standby: the robot reports OVER_TEMPERATURE_RIGHT: " + FAULTS["OVER_TEMPERATURE_RIGHT"].advice,
     )
-
-
-def test_what_else_the_robot_rejects_is_a_warning():
-    robot = RobotInTime(b"")
-    robot.disturb = Frame(0x101, bytes(8))
-    result = check._hearing_check(check._query_robot(robot, create_driver(None), RobotPoses()))
-    assert result.level is Level.WARNING
-    assert "checksum" in result.text
 
 
 class Antenna:
@@ -115,7 +117,7 @@ class Antenna:
     ],
 )
 def test_poses_without_heading_or_none_at_all_are_a_warning_with_the_reason(silent, expected_text):
-    reported = check._telemetry_check(check._query_robot(RobotInTime(b""), create_driver(None), Antenna(silent)))
+    reported = check._telemetry_check(query(RobotInTime(b""), poses=Antenna(silent)))
     assert reported.level is Level.WARNING
     assert expected_text in reported.text
 
@@ -129,7 +131,7 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
         f'[daemon]\ncontrol_socket = "{tmp_path}/control.sock"\n'
     )
     with (
-        closing(Daemon(tmp_path / "control.sock", {})),
+        closing(ControlDaemon(tmp_path / "control.sock", lambda _: {"ok": True})),
         pytest.raises(pytest.exit.Exception, match="a daemon is connected to this robot") as caught,
     ):
         test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))

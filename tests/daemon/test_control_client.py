@@ -7,38 +7,18 @@ import pytest
 from disco_hw.daemon import send_request
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import WorkError
+from tests.daemon.control_daemon import ControlDaemon
 
-
-class Daemon:
-    """A control server polled by a thread of its own, answering every request."""
-
-    def __init__(self, path, body):
-        self.server = ControlServer(path, ["status", "arm"])
-        self.body = body
-        self.stopping = threading.Event()
-        self.thread = threading.Thread(target=self.serve)
-        self.thread.start()
-
-    def serve(self):
-        while not self.stopping.wait(0.002):
-            for message in self.server.poll():
-                self.server.reply(message, {"ok": True, "arguments": message.arguments, **self.body})
-
-    def close(self):
-        self.stopping.set()
-        self.thread.join()
-        self.server.close()
+STATUS = {"do": "status"}
 
 
 @pytest.fixture
-def daemon(tmp_path):
-    daemon = Daemon(tmp_path / "robot.sock", {})
-    yield daemon
-    daemon.close()
+def path(tmp_path):
+    return tmp_path / "robot.sock"
 
 
 def raw_server(path, reply):
-    """Whatever else may listen there: takes one request, sends `answer`, hangs up."""
+    """Whatever else may listen there: takes one request, sends `reply`, hangs up."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     listener.bind(str(path))
     listener.listen(1)
@@ -54,46 +34,35 @@ def raw_server(path, reply):
     return thread
 
 
-def test_a_request_gets_its_reply(daemon):
-    assert send_request(daemon.server.path, {"do": "arm", "why": "test"}) == {
-        "do": "arm",
-        "ok": True,
-        "arguments": {"why": "test"},
-    }
+def test_a_request_gets_its_reply_however_long_and_a_refused_one_what_is_wrong(path):
+    reply = {"ok": True, "text": "x" * 60_000}
+    with closing(ControlDaemon(path, lambda message: {**reply, "arguments": message.arguments})):
+        arguments = {"why": "test"}
+        assert send_request(path, {"do": "arm", **arguments}) == {"do": "arm", "arguments": arguments, **reply}
+        assert "must be one of" in send_request(path, {"do": "fly"})["error"]
 
 
-def test_a_long_reply_arrives_whole(tmp_path):
-    with closing(Daemon(tmp_path / "robot.sock", {"text": "x" * 60_000})) as daemon:
-        assert len(send_request(daemon.server.path, {"do": "status"})["text"]) == 60_000
-
-
-def test_a_refused_request_comes_back_as_a_reply(daemon):
-    assert "must be one of" in send_request(daemon.server.path, {"do": "fly"})["error"]
-
-
-def test_no_daemon_is_one_clear_line(tmp_path):
+def test_no_daemon_is_one_clear_line(path):
     with pytest.raises(WorkError, match=r"robot\.sock: no daemon listens there; start it with `disco-hw run`"):
-        send_request(tmp_path / "robot.sock", {"do": "status"})
+        send_request(path, STATUS)
 
 
-def test_what_a_dead_daemon_left_is_reported_as_no_daemon(tmp_path):
-    path = tmp_path / "robot.sock"
+def test_what_a_dead_daemon_left_is_reported_as_no_daemon(path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
         dead.bind(str(path))
     with pytest.raises(WorkError, match="no daemon listens there"):
-        send_request(path, {"do": "status"})
+        send_request(path, STATUS)
 
 
-def test_a_daemon_that_does_not_answer_is_given_up(tmp_path):
-    path = tmp_path / "robot.sock"
-    server = ControlServer(path, ["status"])
-    with pytest.raises(WorkError, match=r"no answer from the daemon within 0\.05 s"):
-        send_request(path, {"do": "status"}, timeout_s=0.05)
-    server.close()
+def test_a_daemon_that_does_not_answer_is_given_up(path):
+    with (
+        closing(ControlServer(path, ["status"])),
+        pytest.raises(WorkError, match=r"no answer from the daemon within 0\.05 s"),
+    ):
+        send_request(path, STATUS, timeout_s=0.05)
 
 
-def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
-    path = tmp_path / "robot.sock"
+def test_a_stranger_that_drips_without_end_is_given_up(path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(str(path))
         listener.listen(1)
@@ -108,7 +77,7 @@ def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
         thread = threading.Thread(target=drip)
         thread.start()
         with pytest.raises(WorkError, match="no answer"):
-            send_request(path, {"do": "status"}, timeout_s=0.1)
+            send_request(path, STATUS, timeout_s=0.1)
         given_up.set()
         thread.join()
 
@@ -122,14 +91,13 @@ def test_a_stranger_that_drips_without_end_is_given_up(tmp_path):
         (b"5\n", "is not"),
     ],
 )
-def test_a_stranger_on_the_socket_is_reported(tmp_path, reply, message):
-    path = tmp_path / "robot.sock"
+def test_a_stranger_on_the_socket_is_reported(path, reply, message):
     thread = raw_server(path, reply)
     with pytest.raises(WorkError, match=message):
-        send_request(path, {"do": "status"})
+        send_request(path, STATUS)
     thread.join()
 
 
 def test_a_path_that_cannot_be_is_reported(tmp_path):
     with pytest.raises(WorkError, match="too long"):
-        send_request(tmp_path / ("x" * 200), {"do": "status"})
+        send_request(tmp_path / ("x" * 200), STATUS)

@@ -40,16 +40,24 @@ def send(connection, *requests):
 
 
 def lines_from(connection):
-    data = connection.recv(1 << 20)
-    return [json.loads(line) for line in data.splitlines()]
+    return [json.loads(line) for line in connection.recv(1 << 20).splitlines()]
+
+
+def polled(server):
+    """The actions that a poll hands over."""
+    return [message.action for message in server.poll()]
+
+
+def assert_takes_an_estop(server):
+    with connect(server) as client:
+        send(client, {"do": "estop"})
+        assert polled(server) == ["estop"]
 
 
 def hung_up(connection):
-    try:
+    with suppress(ConnectionResetError):
         while connection.recv(1 << 16):
             pass
-    except ConnectionResetError:
-        pass
     return True
 
 
@@ -101,7 +109,7 @@ def test_a_request_in_pieces_is_put_together(server):
             client.sendall(piece)
             assert server.poll() == []
         client.sendall(b"\n\n  \n")
-        assert [message.action for message in server.poll()] == ["status"]
+        assert polled(server) == ["status"]
 
 
 def test_replies_that_are_not_numbers_are_still_json(server):
@@ -138,8 +146,8 @@ def test_estop_comes_first_across_clients_and_within_one(server):
     with connect(server) as eager, connect(server) as worried:
         send(eager, {"do": "arm"}, {"do": "start"}, {"do": "status"}, {"do": "status"}, {"do": "status"})
         send(worried, {"do": "status"}, {"do": "estop"})
-        assert [message.action for message in server.poll()] == ["estop", "arm", "start", "status", "status", "status"]
-        assert [message.action for message in server.poll()] == ["status"]
+        assert polled(server) == ["estop", "arm", "start", "status", "status", "status"]
+        assert polled(server) == ["status"]
 
 
 def test_estop_gets_in_although_idle_clients_hold_every_place(server):
@@ -148,13 +156,11 @@ def test_estop_gets_in_although_idle_clients_hold_every_place(server):
         server.poll()
     send(idle[0], {"do": "status"})
     server.poll()
-    with connect(server) as worried:
-        send(worried, {"do": "estop"})
-        assert [message.action for message in server.poll()] == ["estop"]
+    assert_takes_an_estop(server)
     # The one that waited longest without a word had to go, not the first to come.
     assert hung_up(idle[1])
     send(idle[0], {"do": "status"})
-    assert [message.action for message in server.poll()] == ["status"]
+    assert polled(server) == ["status"]
     for client in idle:
         client.close()
 
@@ -162,11 +168,9 @@ def test_estop_gets_in_although_idle_clients_hold_every_place(server):
 def test_estop_passes_a_flood_of_another_client(server):
     with connect(server) as flood, connect(server) as worried:
         flood.setblocking(False)
-        try:
+        with suppress(BlockingIOError):
             while True:
                 flood.send(b'{"do":"status"}\n' * 1000)
-        except BlockingIOError:
-            pass
         send(worried, {"do": "estop"})
         assert server.poll()[0].action == "estop"
 
@@ -258,9 +262,7 @@ def test_more_connections_than_places_at_once_do_no_harm(server):
         clients.append(client)
     for _ in range(20):
         server.poll()
-    with connect(server) as client:
-        send(client, {"do": "estop"})
-        assert [message.action for message in server.poll()] == ["estop"]
+    assert_takes_an_estop(server)
     for client in clients:
         client.close()
     server.poll()
@@ -291,7 +293,7 @@ def test_whatever_bytes_come_nothing_raises_and_only_known_actions_pass(pieces):
         server.poll()
         with connect(server) as client:
             send(client, {"do": "status"})
-            assert [message.action for message in server.poll()] == ["status"]
+            assert polled(server) == ["status"]
 
 
 # --- whose it is ------------------------------------------------------------------------------------------------------
@@ -303,18 +305,16 @@ def test_socket_and_directory_are_the_owners_alone(server):
 
 
 def test_other_users_are_hung_up_on(tmp_path):
-    server = ControlServer(tmp_path / "robot.sock", ACTIONS, allowed_uids={os.geteuid() + 1})
-    with connect(server) as client:
+    others = {os.geteuid() + 1}
+    with closing(ControlServer(tmp_path / "robot.sock", ACTIONS, others)) as server, connect(server) as client:
         send(client, {"do": "arm"})
         assert server.poll() == []
         assert hung_up(client)
-    server.close()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to become another user")
 def test_another_user_is_distinguished_even_when_the_files_let_it_in():
-    with tempfile.TemporaryDirectory() as directory:
-        server = ControlServer(Path(directory) / "robot.sock", ACTIONS)
+    with tempfile.TemporaryDirectory() as folder, closing(ControlServer(Path(folder) / "x", ACTIONS)) as server:
         server.path.chmod(0o666)
         server.path.parent.chmod(0o711)
         child = os.fork()
@@ -326,7 +326,6 @@ def test_another_user_is_distinguished_even_when_the_files_let_it_in():
             os._exit(7)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
         assert server.poll() == []
-        server.close()
 
 
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o1777])
@@ -357,11 +356,8 @@ def test_a_living_daemon_is_not_displaced_and_what_a_killed_one_left_is_replaced
             client.connect(str(path))
         kill(process)
     assert path.is_socket()
-    server = ControlServer(path, ACTIONS)
-    with connect(server) as client:
-        send(client, {"do": "estop"})
-        assert [message.action for message in server.poll()] == ["estop"]
-    server.close()
+    with closing(ControlServer(path, ACTIONS)) as server:
+        assert_takes_an_estop(server)
 
 
 def test_a_child_of_a_killed_daemon_does_not_keep_the_socket(tmp_path):

@@ -13,20 +13,18 @@ import can
 import pytest
 
 from disco_hw.config import SHIPPED_ROBOT
-from disco_hw.daemon import SERVED, emergency
-from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.daemon import emergency
 from disco_hw.daemon.emergency import stop_and_report, stop_robot
 from disco_hw.errors import InputError
 from drivers.motor import find_driver
 from drivers.types import Frame, LinkState, ReceivedFrame
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from tests.daemon.control_daemon import ControlDaemon
 
-SHIPPED = (SHIPPED_ROBOT).read_text(encoding="utf-8")
+SHIPPED = SHIPPED_ROBOT.read_text(encoding="utf-8")
 
 UART_NODE = 51
-
-
 STATE = {
     "state": "ESTOP", "fault": "NONE", "session": 0, "estop_source": "FRAME", "last_command_counter": 0,
     "rejected_count": 0, "reject_reason": "NONE", "stop_cause": "NONE",
@@ -64,29 +62,24 @@ def robot_file(directory, socket, link='interface = "virtual"', **others):
 
 @pytest.fixture
 def daemon(tmp_path):
-    """Serves a control socket that takes an e-stop; its status, and what it was asked, are attributes."""
+    """A daemon that takes an e-stop and whose status is an attribute."""
 
-    class Daemon:
-        status, actions, ending = {"ok": True, "robot_state": "READY", "link": "up"}, [], False
+    def reply(message):
+        return made.status if message.action == "status" else {"ok": True}
 
-    directory = tmp_path / "run"
-    directory.mkdir(mode=0o700)
-    Daemon.socket = directory / "control.sock"
-    server = ControlServer(Daemon.socket, SERVED)
+    made = ControlDaemon(tmp_path / "run" / "control.sock", reply)
+    made.status = {"ok": True, "robot_state": "READY", "link": "up"}
+    yield made
+    made.close()
 
-    def serve():
-        while not Daemon.ending:
-            for message in server.poll():
-                Daemon.actions.append(message.action)
-                server.reply(message, Daemon.status if message.action == "status" else {"ok": True})
-            time.sleep(0.002)
 
-    thread = threading.Thread(target=serve)
-    thread.start()
-    yield Daemon
-    Daemon.ending = True
-    thread.join()
-    server.close()
+@pytest.fixture
+def line():
+    """A serial line: the robot's end and the host's, as open files."""
+    ends = pty.openpty()
+    yield ends
+    for end in ends:
+        os.close(end)
 
 
 def test_a_socket_that_cannot_be_looked_at_does_not_hide_what_became_of_the_link(tmp_path):
@@ -98,8 +91,8 @@ def test_a_socket_that_cannot_be_looked_at_does_not_hide_what_became_of_the_link
 
 def test_a_link_section_that_says_nothing_leaves_the_daemon(tmp_path, daemon):
     daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
-    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link="interface = 7"))
-    assert daemon.actions[0] == "estop"
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link="interface = 7"))
+    assert daemon.actions()[0] == "estop"
     assert outcome.sent
     assert outcome.confirmed
     assert "interface" in outcome.link_error
@@ -118,7 +111,7 @@ def test_a_misspelt_field_of_the_link_does_not_keep_the_stop_from_it(tmp_path):
 def test_a_daemon_that_holds_the_stop_until_its_link_is_up_has_not_sent_it(tmp_path, daemon):
     daemon.status = {**daemon.status, "link": "connecting", "robot_state": "UNKNOWN"}
     without_bus = {"/tmp/disco-hw-wombot.can": "/nowhere/bus"}
-    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link='interface = "unixcan"', **without_bus))
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link='interface = "unixcan"', **without_bus))
     assert not outcome.sent
     assert "NOT SENT" in outcome.as_text()
     assert "connecting" in outcome.as_text()
@@ -126,7 +119,7 @@ def test_a_daemon_that_holds_the_stop_until_its_link_is_up_has_not_sent_it(tmp_p
 
 def test_a_robot_state_from_before_the_request_confirms_nothing(tmp_path, daemon):
     daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns()}
-    outcome = stop_robot(robot_file(tmp_path, daemon.socket, link="interface = 7"))
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link="interface = 7"))
     assert outcome.sent
     assert not outcome.confirmed
     assert "the robot has not confirmed" in outcome.as_text()
@@ -149,28 +142,24 @@ def frames_on(line, settle_s=0.1):
     return frames
 
 
-def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp_path, monkeypatch):
-    frame_id, data = Codec().encode("SYSTEM_STATE", **STATE)
-    robot_end, host_end = pty.openpty()
-    try:
-        tty.setraw(host_end)
-        os.write(robot_end, encode_frame(frame_id, data))
-        robot = robot_file(tmp_path, tmp_path / "none", **{"/tmp/disco-hw-wombot.tty": os.ttyname(host_end)})
-        assert not stop_robot(robot, "serial").confirmed
-        frames_on(robot_end)
-        monkeypatch.setattr(emergency, "_CONFIRM_S", 30.0)
+def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp_path, monkeypatch, line):
+    robot_end, host_end = line
+    tty.setraw(host_end)
+    state = encode_frame(*Codec().encode("SYSTEM_STATE", **STATE))
+    os.write(robot_end, state)
+    robot = robot_file(tmp_path, tmp_path / "none", **{"/tmp/disco-hw-wombot.tty": os.ttyname(host_end)})
+    assert not stop_robot(robot, "serial").confirmed
+    frames_on(robot_end)
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 30.0)
 
-        def reply():
-            frames_on(robot_end, settle_s=0.0)
-            os.write(robot_end, encode_frame(frame_id, data))
+    def reply():
+        frames_on(robot_end, settle_s=0.0)
+        os.write(robot_end, state)
 
-        answering = threading.Thread(target=reply)
-        answering.start()
-        assert stop_robot(robot, "serial").confirmed
-        answering.join()
-    finally:
-        os.close(robot_end)
-        os.close(host_end)
+    answering = threading.Thread(target=reply)
+    answering.start()
+    assert stop_robot(robot, "serial").confirmed
+    answering.join()
 
 
 BROKEN = {
@@ -204,40 +193,31 @@ def test_without_a_file_that_can_be_read_the_option_says_where_the_link_is(tmp_p
     assert outcome.as_dict()["file_error"] == outcome.file_error
 
 
-def test_over_a_serial_port_that_the_option_names_the_stop_goes_out(tmp_path):
-    ours, theirs = pty.openpty()
-    try:
-        outcome = stop_robot(tmp_path / "none.toml", f"serial:{os.ttyname(theirs)}")
-        frames = frames_on(ours)
-    finally:
-        os.close(ours)
-        os.close(theirs)
+def test_over_a_serial_port_that_the_option_names_the_stop_goes_out(tmp_path, line):
+    robot_end, host_end = line
+    outcome = stop_robot(tmp_path / "none.toml", f"serial:{os.ttyname(host_end)}")
     assert (outcome.link_error, outcome.sent, outcome.confirmed) == (None, True, False)
-    assert {Codec().decode(can_id, data).name for can_id, data in frames} == {"ESTOP"}
+    assert {Codec().decode(can_id, data).name for can_id, data in frames_on(robot_end)} == {"ESTOP"}
 
 
 @pytest.mark.parametrize("name", ["roboclaw", "vesc"])
 def test_a_line_of_one_request_at_a_time_is_left_to_a_daemon_that_lives_and_taken_beside_a_dead_one(
-    tmp_path, daemon, name
+    tmp_path, daemon, line, name
 ):
     """Two that speak on such a line at once spoil each other's packets."""
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
+    robot_end, host_end = line
+    tty.setraw(host_end)
     driver = find_driver(name)
     settings = driver.example + (f"uart_node = {UART_NODE}\n" if driver.serial_field else "")
     link = f'interface = "virtual"\ndriver = "{name}"\n{settings}'
-    serial = {'kind = "can"': 'kind = "serial"', "/tmp/disco-hw-wombot.tty": os.ttyname(theirs)}
-    try:
-        outcome = stop_robot(robot_file(tmp_path, daemon.socket, link=link, **serial))
-        assert (daemon.actions[0], outcome.sent) == ("estop", True)
-        assert "left to the daemon" in outcome.link_error
-        assert not select.select([ours], [], [], 0.0)[0], "nobody else speaks on the line"
-        outcome = stop_robot(robot_file(tmp_path, tmp_path / "none", link=link, **serial))
-        assert (outcome.link_error, outcome.sent) == (None, True)
-        assert os.read(ours, 4096)
-    finally:
-        os.close(ours)
-        os.close(theirs)
+    serial = {'kind = "can"': 'kind = "serial"', "/tmp/disco-hw-wombot.tty": os.ttyname(host_end)}
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link=link, **serial))
+    assert (daemon.actions()[0], outcome.sent) == ("estop", True)
+    assert "left to the daemon" in outcome.link_error
+    assert not select.select([robot_end], [], [], 0.0)[0], "nobody else speaks on the line"
+    outcome = stop_robot(robot_file(tmp_path, tmp_path / "none", link=link, **serial))
+    assert (outcome.link_error, outcome.sent) == (None, True)
+    assert os.read(robot_end, 4096)
 
 
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
@@ -256,6 +236,6 @@ def test_what_is_said_of_a_confirmed_stop_is_what_the_controller_does(latches, e
 def test_only_a_robot_that_confirms_ends_the_command_with_0(tmp_path, daemon, confirmed, capsys):
     after = time.monotonic_ns() + 10**10
     daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": after if confirmed else 0}
-    robot = robot_file(tmp_path, daemon.socket, link="interface = 7")
+    robot = robot_file(tmp_path, daemon.server.path, link="interface = 7")
     assert stop_and_report(robot, None, as_json=False) == (0 if confirmed else 1)
     assert ("has not confirmed" in capsys.readouterr().out) is not confirmed

@@ -1,7 +1,7 @@
 """The connection that an e-stop goes over: no new descriptor, and a new one after the daemon was started again."""
 
 import resource
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import pytest
 
@@ -25,36 +25,27 @@ def no_descriptors():
 
 def test_a_kept_connection_needs_no_descriptor_and_outlives_a_restart_of_the_daemon(tmp_path):
     daemon = Daemon(tmp_path / "run")
-    kept = KeptConnection(daemon.server.path)
-    kept.ensure_connected()
-    # Accepted, in this same process.
-    assert kept.request({"do": "status"}, 60.0)["ok"]
-    with no_descriptors():
-        assert all(kept.request({"do": "estop"}, 60.0)["ok"] for _ in range(3))
-    path = daemon.server.path
-    daemon.close()
-    with pytest.raises(WorkError, match="no daemon listens there"):
-        kept.request({"do": "estop"}, 60.0)
-    for left in path.parent.iterdir():
-        left.unlink()
-    path.parent.rmdir()
-    again = Daemon(path.parent)
-    assert kept.request({"do": "estop"}, 60.0)["ok"]
-    kept.close()
-    again.close()
+    with closing(KeptConnection(daemon.server.path)) as kept:
+        kept.ensure_connected()
+        # Accepted, in this same process.
+        assert kept.request({"do": "status"}, 60.0)["ok"]
+        with no_descriptors():
+            assert all(kept.request({"do": "estop"}, 60.0)["ok"] for _ in range(3))
+        daemon.close()
+        with pytest.raises(WorkError, match="no daemon listens there"):
+            kept.request({"do": "estop"}, 60.0)
+        with closing(Daemon(tmp_path / "run")):
+            assert kept.request({"do": "estop"}, 60.0)["ok"]
 
 
 def test_a_reply_that_came_too_late_is_not_taken_for_the_next(tmp_path):
-    daemon = Daemon(tmp_path / "run")
-    kept = KeptConnection(daemon.server.path)
-    assert kept.request({"do": "status"}, 60.0)["ok"]
-    daemon.hangs = True
-    with pytest.raises(WorkError, match="no answer"):
-        kept.request({"do": "status"}, 0.05)
-    daemon.hangs = False
-    assert kept.request({"do": "estop"}, 60.0)["do"] == "estop"
-    kept.close()
-    daemon.close()
+    with closing(Daemon(tmp_path / "run")) as daemon, closing(KeptConnection(daemon.server.path)) as kept:
+        assert kept.request({"do": "status"}, 60.0)["ok"]
+        daemon.hangs = True
+        with pytest.raises(WorkError, match="no answer"):
+            kept.request({"do": "status"}, 0.05)
+        daemon.hangs = False
+        assert kept.request({"do": "estop"}, 60.0)["do"] == "estop"
 
 
 def test_a_reserve_gives_its_descriptors_to_the_block_alone():

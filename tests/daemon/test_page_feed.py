@@ -15,6 +15,7 @@ from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import MemoryRecorder
 from drivers.types import WheelSample
+from tests.drivers.waiting import wait_until
 from tools.viewer_run import PERIOD_NS, tick_records
 
 _WATCH = """
@@ -32,42 +33,55 @@ while True:
 
 
 @pytest.fixture
-def feed(tmp_path):
-    made = ViewerFeed(tmp_path / "control.sock.view")
-    yield made
-    made.close()
+def path(tmp_path):
+    return feed_path(tmp_path / "control.sock")
 
 
-def connected(feed, *subscribers, timeout_s=60.0):
-    """Tick until every subscriber has got something; returns the next tick's number."""
-    deadline = time.monotonic() + timeout_s
-    tick, waiting = 0, set(subscribers)
-    while waiting:
-        assert time.monotonic() < deadline, "nothing came through"
+@pytest.fixture
+def feed(path):
+    with closing(ViewerFeed(path)) as made:
+        yield made
+
+
+@pytest.fixture
+def subscriber(feed, path):
+    with closing(FeedSubscriber(path)) as made:
+        yield made
+
+
+def put_ticks(feed, first, count):
+    """Feed the records of so many ticks; returns the next tick's number."""
+    for tick in range(first, first + count):
         feed.put(*tick_records(tick))
-        tick += 1
+    return first + count
+
+
+def connected(feed, *subscribers):
+    """Tick until every subscriber has got something; returns the next tick's number."""
+    tick, waiting = 0, set(subscribers)
+
+    def everybody_got_something():
+        nonlocal tick, waiting
+        tick = put_ticks(feed, tick, 1)
         waiting -= {subscriber for subscriber in waiting if subscriber.receive(0.01)}
+        return not waiting
+
+    wait_until(everybody_got_something, 60.0)
     return tick
 
 
-def test_a_loop_whose_ticks_are_late_now_and_then_is_shown_25_times_a_second(feed, tmp_path):
-    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
+def test_a_loop_whose_ticks_are_late_now_and_then_is_shown_25_times_a_second(feed, subscriber):
     first = connected(feed, subscriber)
     sent = feed.sent
     for tick in range(first, first + 500):
         now_ns, got = tick_records(tick)
         feed.put(now_ns + tick % 7 * 50_000, got)
-    subscriber.close()
     assert feed.sent - sent == pytest.approx(250, abs=2)
 
 
 @pytest.mark.parametrize("ticks_before", range(5))
-def test_records_arrive_whole_and_without_frames(feed, tmp_path, ticks_before):
-    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
-    tick = connected(feed, subscriber)
-    for number in range(tick, tick + ticks_before):
-        feed.put(*tick_records(number))
-    tick += ticks_before
+def test_records_arrive_whole_and_without_frames(feed, subscriber, ticks_before):
+    tick = put_ticks(feed, connected(feed, subscriber), ticks_before)
     first_ns = tick_records(tick)[0]
     sent = []
     for number in range(tick, tick + 30):
@@ -78,11 +92,7 @@ def test_records_arrive_whole_and_without_frames(feed, tmp_path, ticks_before):
     sent.append(records.Event(last_ns, "info", "daemon", "the last one"))
     feed.put(last_ns, sent[-1:])
     received = []
-    deadline = time.monotonic() + 60.0
-    while not received or received[-1][0] < last_ns:
-        assert time.monotonic() < deadline
-        received += subscriber.receive(0.1)
-    subscriber.close()
+    wait_until(lambda: received.extend(subscriber.receive(0.1)) or (received and received[-1][0] >= last_ns), 60.0)
     # What the ticks before left behind, to be published or on its way, depends on when the connection came about.
     got_records = [record for _, record in received if record.t_ns >= first_ns]
     assert [record for record in got_records if not isinstance(record, records.Plan)] == sent
@@ -94,38 +104,30 @@ def test_records_arrive_whole_and_without_frames(feed, tmp_path, ticks_before):
 
 
 def test_nobody_looking_costs_nothing_and_keeps_nothing(feed):
-    for tick in range(500):
-        feed.put(*tick_records(tick))
+    put_ticks(feed, 0, 500)
     assert feed.sent == 0
     assert feed._pending == []
 
 
-def test_the_feed_notices_that_everybody_left(feed, tmp_path):
-    subscriber = FeedSubscriber(tmp_path / "control.sock.view")
+def test_the_feed_notices_that_everybody_left(feed, subscriber):
     tick = connected(feed, subscriber)
     subscriber.close()
-    deadline = time.monotonic() + 60.0
-    while True:
-        assert time.monotonic() < deadline, "it goes on publishing"
-        before = feed.sent
-        for number in range(tick, tick + 10):
-            feed.put(*tick_records(number))
-        tick += 10
-        time.sleep(0.01)
-        if feed.sent == before:
-            return
+
+    def publishes_no_more():
+        nonlocal tick
+        before, tick = feed.sent, put_ticks(feed, tick, 10)
+        return feed.sent == before
+
+    wait_until(publishes_no_more, 60.0)
 
 
-def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, tmp_path):
-    path = tmp_path / "control.sock.view"
+def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, subscriber, path):
     process = subprocess.Popen([sys.executable, "-c", _WATCH, str(path)], stdout=subprocess.PIPE, text=True)
-    other = FeedSubscriber(path)
     try:
         assert process.stdout.readline() == "ready\n"
-        tick = connected(feed, other)
+        tick = connected(feed, subscriber)
         while process.stdout.readline().startswith("0 "):
-            feed.put(*tick_records(tick))
-            tick += 1
+            tick = put_ticks(feed, tick, 1)
         os.kill(process.pid, signal.SIGSTOP)
         slow, seen = 0, 0
         for number in range(tick, tick + 12_000):
@@ -134,11 +136,11 @@ def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, tmp_pat
             feed.put(now_ns, got)
             slow += time.perf_counter() - begun > 0.02
             if number % 20 == 0:
-                seen += len(other.receive(0.001))
+                seen += len(subscriber.receive(0.001))
         # Once nothing more fits into the stopped page's socket each one would wait; a host that pauses makes few wait.
         assert slow < 1000, "it waited"
         assert feed.refused == 0
-        seen += len(other.receive(2.0))
+        seen += len(subscriber.receive(2.0))
         assert seen > 10_000, "the other page starved"
         os.kill(process.pid, signal.SIGCONT)
         tick, deadline = tick + 12_000, time.monotonic() + 60.0
@@ -149,54 +151,28 @@ def test_a_stopped_page_holds_up_neither_the_feed_nor_another_page(feed, tmp_pat
             tick += 5
             missed = int(process.stdout.readline().split()[1])
     finally:
-        other.close()
         process.kill()
         process.wait()
 
 
-def test_what_cannot_be_encoded_is_counted(feed, tmp_path):
-    with closing(FeedSubscriber(tmp_path / "control.sock.view")) as subscriber:
-        tick = connected(feed, subscriber)
-        # What waits goes out with the next tick, so that the event is alone in its batch.
-        feed.put(*tick_records(tick + 50))
-        now_ns = tick_records(tick + 100)[0]
-        feed.put(now_ns, [records.Event(now_ns, "info", "x", object())])
-        assert feed.refused == 1
+def test_what_cannot_be_encoded_is_counted(feed, subscriber):
+    tick = connected(feed, subscriber)
+    # What waits goes out with the next tick, so that the event is alone in its batch.
+    feed.put(*tick_records(tick + 50))
+    now_ns = tick_records(tick + 100)[0]
+    feed.put(now_ns, [records.Event(now_ns, "info", "x", object())])
+    assert feed.refused == 1
 
 
-def test_garbage_is_counted_by_the_subscriber(tmp_path):
-    import zmq
-
-    context = zmq.Context()
-    socket = context.socket(zmq.PUB)
-    socket.bind(f"ipc://{tmp_path}/feed")
-    subscriber = FeedSubscriber(tmp_path / "feed")
-    deadline = time.monotonic() + 60.0
-    while subscriber.malformed < 3:
-        assert time.monotonic() < deadline
-        for garbage in (b"", b"\xc1", b"\x93\x01\x02\x91\x92\x63\xc0"):
-            socket.send(garbage)
-        assert subscriber.receive(0.05) == []
-    subscriber.close()
-    socket.close(0)
-    context.term()
-
-
-def test_a_page_survives_the_daemons_restart(tmp_path):
-    path = tmp_path / "feed"
-    first = ViewerFeed(path)
-    subscriber = FeedSubscriber(path)
-    connected(first, subscriber)
-    first.close()
-    second = ViewerFeed(path)
-    connected(second, subscriber)
-    subscriber.close()
-    second.close()
+def test_a_page_survives_the_daemons_restart(path):
+    with closing(FeedSubscriber(path)) as subscriber:
+        for _ in range(2):
+            with closing(ViewerFeed(path)) as feed:
+                connected(feed, subscriber)
     assert not path.exists()
 
 
-def test_the_socket_is_its_owners_alone(feed, tmp_path):
-    path = feed_path(tmp_path / "control.sock")
+def test_the_socket_is_its_owners_alone(feed, path):
     assert path.is_socket()
     assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0
 
@@ -217,27 +193,21 @@ def test_the_recorder_gets_everything_first(feed):
 
 
 def test_who_wants_each_tick_has_its_wheels_before_its_record(feed, tmp_path):
-    ticks = ViewerFeed(tmp_path / "control.sock.tick", period_s=0.0)
-    subscriber = FeedSubscriber(tmp_path / "control.sock.tick")
-    memory = MemoryRecorder()
-    recorder = WatchedRecorder(memory, feed, ticks)
-    now_ns, got = tick_records(connected(ticks, subscriber))
-    wheels = [record for record in got if isinstance(record, WheelSample)]
-    recorder.announce(now_ns, wheels)
-    assert wheels
-    assert received(subscriber, now_ns) == wheels
-    assert memory.ticks == []
-    recorder.put(now_ns, got)
-    assert [record for record in received(subscriber, now_ns) if isinstance(record, WheelSample)] == wheels
-    assert subscriber.missed == 0
-    subscriber.close()
-    ticks.close()
+    path, memory = tmp_path / "control.sock.tick", MemoryRecorder()
+    with closing(ViewerFeed(path, period_s=0.0)) as ticks, closing(FeedSubscriber(path)) as subscriber:
 
+        def received():
+            return wait_until(
+                lambda: [record for tick_ns, record in subscriber.receive(0.1) if tick_ns == now_ns], 60.0
+            )
 
-def received(subscriber, now_ns, timeout_s=60.0):
-    deadline = time.monotonic() + timeout_s
-    while time.monotonic() < deadline:
-        batch = [record for tick_ns, record in subscriber.receive(0.1) if tick_ns == now_ns]
-        if batch:
-            return batch
-    raise AssertionError("nothing came through")
+        recorder = WatchedRecorder(memory, feed, ticks)
+        now_ns, got = tick_records(connected(ticks, subscriber))
+        wheels = [record for record in got if isinstance(record, WheelSample)]
+        recorder.announce(now_ns, wheels)
+        assert wheels
+        assert received() == wheels
+        assert memory.ticks == []
+        recorder.put(now_ns, got)
+        assert [record for record in received() if isinstance(record, WheelSample)] == wheels
+        assert subscriber.missed == 0

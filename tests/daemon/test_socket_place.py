@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import tempfile
-import threading
 from contextlib import closing, contextmanager
 from pathlib import Path
 
@@ -19,11 +18,12 @@ from disco_hw.config import SHIPPED_ROBOT, load_robot_config
 from disco_hw.daemon import ask, believed_users, default_socket_path, passed_over, send_request, socket_path
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.errors import WorkError
+from tests.daemon.control_daemon import ControlDaemon
 from tests.hil.stack import disco_here
 
 ME = os.geteuid()
 NOBODY = 65534
-SHIPPED = (SHIPPED_ROBOT).read_text(encoding="utf-8")
+SHIPPED = SHIPPED_ROBOT.read_text(encoding="utf-8")
 needs_root = pytest.mark.skipif(ME != 0, reason="needs root to act as a second user")
 
 REPLY = b'{"ok": true, "text": "the stranger says", "robot_state": "ESTOP", "robot_state_ns": 9e18, "link": "up"}\n'
@@ -103,6 +103,15 @@ def serve_as_a_daemon(path):
     return act
 
 
+@pytest.fixture
+def service():
+    """A directory of a service user's alone, put by root where only root can."""
+    place = Path(tempfile.mkdtemp(prefix="dhw", dir="/run"))
+    os.chown(place, NOBODY, NOBODY)
+    yield place
+    shutil.rmtree(place)
+
+
 def robot_file(directory, extra=""):
     path = directory / "robot.toml"
     text = SHIPPED.replace("/tmp/disco-hw-wombot.can", "/nowhere/bus")
@@ -156,11 +165,12 @@ def test_a_directory_of_another_user_is_not_believed(tmp_path, monkeypatch):
 
 
 def test_a_listener_of_another_user_is_not_believed(tmp_path, monkeypatch):
-    server = ControlServer(tmp_path / "x.sock", ["status"])
     monkeypatch.setattr(client, "peer_uid", lambda connection: NOBODY)
-    with pytest.raises(WorkError, match=r"a process of .*65534.* listens there; nothing is sent"):
-        send_request(server.path, {"do": "status"})
-    server.close()
+    with (
+        closing(ControlServer(tmp_path / "x.sock", ["status"])),
+        pytest.raises(WorkError, match=r"a process of .*65534.* listens there; nothing is sent"),
+    ):
+        send_request(tmp_path / "x.sock", {"do": "status"})
 
 
 # --- a second user ----------------------------------------------------------------------------------------------------
@@ -171,22 +181,9 @@ def test_what_another_user_made_first_is_passed_over_and_named(temporary, tmp_pa
     occupied = temporary / f"disco-hw-{ME}"
     with as_nobody(serve_as_a_daemon(occupied / "wombot.sock")):
         robot = robot_file(tmp_path)
-        server = ControlServer(default_socket_path("wombot"), ["disarm"])
-        ending = threading.Event()
-
-        def serve():
-            while not ending.wait(0.002):
-                for message in server.poll():
-                    server.reply(message, {"ok": True, "text": "the daemon says"})
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        try:
+        daemon = ControlDaemon(default_socket_path("wombot"), lambda _: {"ok": True, "text": "the daemon says"})
+        with closing(daemon):
             assert ask(robot, "disarm")["text"] == "the daemon says"
-        finally:
-            ending.set()
-            thread.join()
-            server.close()
         assert capsys.readouterr().err == f"disco-hw: {occupied}: belongs to nobody (65534); not used\n"
 
 
@@ -237,34 +234,22 @@ def test_a_configured_socket_of_another_user_is_refused_in_one_line(tmp_path, mo
 
 
 @needs_root
-def test_root_reaches_the_daemon_of_a_service_user():
+def test_root_reaches_the_daemon_of_a_service_user(service):
     # As /run/disco-hw-NAME of the service: put there by root, and the service user's alone.
-    base = Path("/run") if os.access("/run", os.W_OK) else Path("/root")
-    service = Path(tempfile.mkdtemp(prefix="dhw", dir=base))
-    try:
-        service.chmod(0o700)
-        os.chown(service, NOBODY, NOBODY)
-        path = service / "disco-hw" / "wombot.sock"
-        with as_nobody(serve_as_a_daemon(path)):
-            path.parent.chmod(0o700)
-            assert believed_users(path) == {0, NOBODY}
-            assert send_request(path, {"do": "disarm"})["text"] == "the stranger says"
-    finally:
-        shutil.rmtree(service)
+    path = service / "disco-hw" / "wombot.sock"
+    with as_nobody(serve_as_a_daemon(path)):
+        path.parent.chmod(0o700)
+        assert believed_users(path) == {0, NOBODY}
+        assert send_request(path, {"do": "disarm"})["text"] == "the stranger says"
 
 
 @needs_root
-def test_root_finds_it_by_the_runtime_directory_of_the_service(monkeypatch, temporary):
-    service = Path(tempfile.mkdtemp(prefix="dhw", dir="/run"))
-    try:
-        os.chown(service, NOBODY, NOBODY)
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(service))
-        assert default_socket_path("wombot").parent == temporary / "disco-hw-0"
-        with as_nobody(serve_as_a_daemon(service / "disco-hw" / "wombot.sock")):
-            assert default_socket_path("wombot") == service / "disco-hw" / "wombot.sock"
-            assert passed_over(default_socket_path("wombot")) == ()
-    finally:
-        shutil.rmtree(service)
+def test_root_finds_it_by_the_runtime_directory_of_the_service(monkeypatch, temporary, service):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(service))
+    assert default_socket_path("wombot").parent == temporary / "disco-hw-0"
+    with as_nobody(serve_as_a_daemon(service / "disco-hw" / "wombot.sock")):
+        assert default_socket_path("wombot") == service / "disco-hw" / "wombot.sock"
+        assert passed_over(default_socket_path("wombot")) == ()
 
 
 @needs_root

@@ -4,6 +4,7 @@ import shutil
 import socket
 import subprocess
 import sys
+from contextlib import suppress
 from importlib.resources import files
 
 import pytest
@@ -27,11 +28,10 @@ def manager(request, tmp_path):
 def received(listener):
     listener.setblocking(False)
     messages = []
-    try:
+    with suppress(BlockingIOError):
         while True:
             messages.append(listener.recv(4096).decode())
-    except BlockingIOError:
-        return messages
+    return messages
 
 
 def test_messages_arrive_over_path_and_abstract_sockets(manager):

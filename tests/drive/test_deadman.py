@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from disco_hw.drive import ManualInput
+from disco_hw.drive import ManualInput, RobotView
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Manual, Standstill
@@ -93,6 +93,14 @@ def test_release_loss_and_silence_stop_in_the_same_tick(loss, expected_event):
     assert verdict.requests == DISARM
     assert verdict.motion == Standstill()
     assert expected_event in verdict.event
+
+
+def test_what_was_read_cannot_be_changed():
+    manual, seen = ManualInput(1, 0.0, 0.0, deadman=False), RobotView(State.READY, driving=False)
+    with pytest.raises(AttributeError):
+        manual.deadman = True
+    with pytest.raises(AttributeError):
+        seen.driving = True
 
 
 def test_input_of_exactly_200_ms_still_counts():

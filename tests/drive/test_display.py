@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import io
 import threading
-import time
+from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
 
-from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.drive import drive_command
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.terminal import line, show, table
 from disco_hw.errors import InputError, WorkError
+from tests.daemon.control_daemon import ControlDaemon
+from tests.drivers.waiting import wait_until
 
 COVERAGE = Coverage(8.0)
 for _tick in range(251):
@@ -62,21 +63,12 @@ def test_the_line_is_one_line():
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_it_shows_the_daemon_and_ends_with_it(tmp_path, terminal):
-    server = ControlServer(tmp_path / "s" / "control.sock", {"status"})
     console = Console(file=io.StringIO(), force_terminal=terminal, width=160)
-    shown = threading.Thread(target=show, args=(server.path, console))
-    shown.start()
-    try:
-        answered = 0
-        while answered < 3:
-            for message in server.poll():
-                server.reply(message, STATUS)
-                answered += 1
-            time.sleep(0.01)
-        server.poll()
-    finally:
-        server.close()
-        shown.join(10.0)
+    with closing(ControlDaemon(tmp_path / "control.sock", lambda _: STATUS)) as daemon:
+        shown = threading.Thread(target=show, args=(daemon.server.path, console))
+        shown.start()
+        wait_until(lambda: len(daemon.received) >= 3, 60.0)
+    shown.join(10.0)
     assert not shown.is_alive()
     assert "5 s driven" in console.file.getvalue()
 

@@ -48,6 +48,10 @@ class Terminal:
         self.arrived(len(keys))
         return self.poll()
 
+    def hold(self, key=b"w", repeats=5):
+        for _ in range(repeats):
+            self.type(key)
+
     def arrived(self, count):
         """Wait until the reader, which lives in real time, has read so many bytes; 0: the end of the terminal."""
         arrived = self.keyboard._arrived
@@ -76,8 +80,7 @@ def test_what_was_typed_before_is_not_for_us(terminal):
 
 
 def test_a_held_arrow_drives_and_its_end_stops(terminal):
-    for _ in range(10):
-        terminal.type(b"\x1b[A")
+    terminal.hold(b"\x1b[A", repeats=10)
     assert terminal.last.deadman
     assert terminal.last.left_rad_s == terminal.last.right_rad_s == pytest.approx(4.0)
     # The last repeat came 20 ms before the poll that took it.
@@ -86,8 +89,7 @@ def test_a_held_arrow_drives_and_its_end_stops(terminal):
 
 
 def test_nothing_waits_for_enter_and_nothing_is_echoed(terminal):
-    terminal.type(b"w")
-    terminal.type(b"w")
+    terminal.hold(repeats=2)
     assert terminal.last.deadman
     assert not _readable(terminal.master)
 
@@ -99,14 +101,12 @@ def test_pasted_text_holds_nothing(terminal):
 
 
 def test_another_key_among_repeats_stops(terminal):
-    for _ in range(5):
-        terminal.type(b"w")
+    terminal.hold()
     assert not terminal.type(b"w?w").deadman
 
 
 def test_ctrl_d_ends(terminal):
-    for _ in range(5):
-        terminal.type(b"w")
+    terminal.hold()
     assert not terminal.type(b"\x04").deadman
     assert terminal.keyboard.ended == "the operator ended the drive at the keyboard"
     assert terminal.keyboard.completed
@@ -115,8 +115,7 @@ def test_ctrl_d_ends(terminal):
 
 
 def test_keys_count_from_when_they_came_not_from_when_they_are_polled(terminal):
-    for _ in range(5):
-        terminal.type(b"w")
+    terminal.hold()
     os.write(terminal.master, b"w")
     terminal.arrived(1)
     # The loop was held up for 300 ms with a key waiting.
@@ -125,8 +124,7 @@ def test_keys_count_from_when_they_came_not_from_when_they_are_polled(terminal):
 
 
 def test_a_terminal_that_closes_is_a_device_that_is_gone(terminal):
-    for _ in range(5):
-        terminal.type(b"w")
+    terminal.hold()
     os.close(terminal.master)
     terminal.arrived(0)
     assert terminal.poll() is None
@@ -135,18 +133,15 @@ def test_a_terminal_that_closes_is_a_device_that_is_gone(terminal):
     assert terminal.poll() is None
 
 
-def test_the_terminal_is_put_back(terminal):
-    assert termios.tcgetattr(terminal.slave) != terminal.before
+def test_while_keys_are_read_ctrl_c_is_a_signal_and_output_looks_as_before_and_all_is_put_back(terminal):
+    now = termios.tcgetattr(terminal.slave)
+    assert now != terminal.before
+    assert now[3] & termios.ISIG
+    assert now[1] == terminal.before[1]
     terminal.keyboard.close()
     assert termios.tcgetattr(terminal.slave) == terminal.before
     assert not [thread for thread in threading.enumerate() if thread.name == "keyboard"]
     terminal.keyboard.close()
-
-
-def test_ctrl_c_still_is_a_signal_and_output_looks_as_before(terminal):
-    now = termios.tcgetattr(terminal.slave)
-    assert now[3] & termios.ISIG
-    assert now[1] == terminal.before[1]
 
 
 def test_what_is_no_terminal_is_refused(tmp_path):

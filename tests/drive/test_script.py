@@ -1,4 +1,4 @@
-"""Scripts as functions of time, and the room they take."""
+"""Scripts and their pieces as functions of time, the room they take, and what counts as a wheel's limit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from disco_hw.config import Robot
-from disco_hw.drive.script import Manoeuvre, Script, in_table, room_needed
+from disco_hw.drive.script import REST_S, Manoeuvre, Pieces, ReachedLimits, Script, in_table, room_needed
 
 ROBOT = Robot(name="square", wheel_radius_m=0.1, axial_distance_m=0.5, ticks_per_rev=1000, max_wheel_speed_rad_s=10.0)
 
@@ -23,15 +23,11 @@ SCRIPT = Script("two", (manoeuvre("first", 1.0, 10.0, 1.0), manoeuvre("second", 
 
 def test_each_manoeuvre_has_its_own_time():
     assert SCRIPT.duration_s == 3.0
+    assert SCRIPT.at(-0.001) == SCRIPT.at(3.0) == (0.0, 0.0), "before and after them it stands"
     assert SCRIPT.at(0.5) == (10.5, 1.0)
     assert SCRIPT.at(1.0) == (20.0, 2.0)
     assert SCRIPT.at(2.5) == (21.5, 2.0)
     assert SCRIPT.place(2.5)[1] == 1.0
-
-
-def test_before_and_after_it_stands():
-    assert SCRIPT.at(-0.001) == (0.0, 0.0)
-    assert SCRIPT.at(3.0) == (0.0, 0.0)
 
 
 def test_a_script_needs_a_manoeuvre():
@@ -65,3 +61,64 @@ def test_the_table_says_when_what_and_what_for():
         ["0.0", "s", "first", "for", "first"],
         ["1.0", "s", "second", "for", "second"],
     ]
+
+
+PIECES = Pieces(5.0)
+
+
+@pytest.mark.parametrize(
+    ("forward", "turn", "wheels"),
+    [(1.0, 0.0, (5.0, 5.0)), (0.0, 0.4, (-2.0, 2.0)), (-0.5, 0.2, (-3.5, -1.5)), (0.5, -0.5, (5.0, 0.0))],
+)
+def test_shares_are_of_the_largest_speed_and_left_turns_have_the_right_wheel_ahead(forward, turn, wheels):
+    manoeuvre = PIECES.hold("name", "purpose", 2.0, forward, turn)
+    assert manoeuvre.wheels(0.0) == pytest.approx(wheels)
+    assert manoeuvre.wheels(1.9) == pytest.approx(wheels)
+    assert (manoeuvre.name, manoeuvre.purpose, manoeuvre.duration_s) == ("name", "purpose", 2.0)
+
+
+def test_a_played_piece_follows_its_profile():
+    played = PIECES.play("name", "purpose", 2.0, lambda t_s: (0.1 * t_s, 0.0))
+    assert played.wheels(0.0) == (0.0, 0.0)
+    assert played.wheels(2.0) == pytest.approx((1.0, 1.0))
+
+
+def test_each_piece_is_followed_by_a_rest():
+    found = PIECES.each("purpose", ("one", 1.0, 0.5, 0.0), ("two", 3.0, 0.0, 0.5))
+    assert [part.name for part in found] == ["one", "rest", "two", "rest"]
+    assert [part.duration_s for part in found] == [1.0, REST_S, 3.0, REST_S]
+    assert found[1].wheels(0.3) == (0.0, 0.0)
+
+
+def limits(**observed):
+    """Manoeuvres with their samples (commanded, measured) of the left wheel; the right one does as commanded."""
+    found = ReachedLimits()
+    for manoeuvre, samples in observed.items():
+        for commanded, measured in samples:
+            found.observe(manoeuvre, (commanded, commanded), (measured, commanded))
+    return found
+
+
+def test_what_was_reached_is_the_limit_each_way():
+    found = limits(ahead=[(6.0, 4.5)] * 3, back=[(-6.0, -3.0)] * 3)
+    assert found.within((6.0, 6.0)) == (4.5, 6.0)
+    assert found.within((-6.0, -6.0)) == (-3.0, -6.0)
+    assert found.within((2.0, 0.0)) == (1.5, 0.0)
+    assert found.describe() == "found: left -3.0 to +4.5, right -6.0 to +6.0 rad/s"
+
+
+def test_the_manoeuvre_where_it_reached_least_counts():
+    assert limits(straight=[(6.0, 6.0)] * 9, turning=[(6.0, 3.0)]).within((6.0, 0.0))[0] == 3.0
+
+
+def test_single_bad_samples_do_not_count():
+    assert limits(ahead=[(6.0, 4.5)] * 4 + [(6.0, 0.0)]).within((6.0, 0.0))[0] == 4.5
+
+
+@pytest.mark.parametrize(("measured", "limit"), [(5.8, 6.0), (7.0, 6.0), (-1.0, 0.0)])
+def test_close_is_reached_and_the_wrong_way_is_nothing(measured, limit):
+    assert limits(ahead=[(6.0, measured)]).within((6.0, 0.0))[0] == limit
+
+
+def test_a_measurement_that_is_no_number_limits_nothing():
+    assert limits(ahead=[(6.0, float("nan"))]).within((6.0, 0.0))[0] == 6.0

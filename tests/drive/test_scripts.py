@@ -30,8 +30,9 @@ def test_wheels_stay_within_the_share_of_the_limit(name, top, share, seed):
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_scripts_end_at_rest_and_say_what_for(name):
+def test_scripts_end_at_rest_say_what_for_and_take_a_minute_at_most_where_a_report_asks_for_them(name):
     script = create_script(name, robot(), CircleTask(), 0.8)
+    assert name not in SEPARATING or script.duration_s <= 60.0
     assert script.at(script.duration_s - 0.01) == (0.0, 0.0)
     assert all(manoeuvre.purpose for manoeuvre in script.manoeuvres)
 
@@ -92,11 +93,6 @@ def test_excite_takes_about_two_minutes_and_little_room():
 def test_an_unknown_script_is_refused_with_the_names_there_are():
     with pytest.raises(InputError, match="circle, steps, excite"):
         create_script("dance", robot(), CircleTask(), 0.8)
-
-
-@pytest.mark.parametrize("name", SEPARATING)
-def test_a_drive_that_a_report_asks_for_takes_a_minute_at_most(name):
-    assert create_script(name, robot(), CircleTask(), 0.8).duration_s <= 60.0
 
 
 def test_every_effect_names_a_script_that_can_be_driven():

@@ -40,12 +40,13 @@ def test_curves_turn_both_ways_at_two_speeds_while_they_go_forward():
     assert np.unique(np.round(forward[turn != 0.0], 6)).size == 2
 
 
-def test_starts_are_many_and_both_ways():
+def test_starts_are_many_and_reach_two_speeds_both_ways():
     forward, turn = driven("starts").T
     begins = (forward[:-1] == 0.0) & (np.abs(forward[1:]) > 0.45 * TOP_RAD_S)
     assert np.count_nonzero(begins) == 12
     assert {np.sign(value) for value in forward[1:][begins]} == {1.0, -1.0}
     assert np.ptp(turn) > 0.5 * TOP_RAD_S
+    assert speeds(forward[turn == 0.0]) == {TOP_RAD_S, 0.5 * TOP_RAD_S}
 
 
 def test_ramps_cross_zero_slowly():
@@ -69,11 +70,6 @@ def test_all_together_turn_fast_and_go_straight_both_ways_at_either_end():
         reached = np.flatnonzero(np.abs(values) > least)
         at_start, at_end = reached[reached < 0.2 * turn.size], reached[reached > 0.8 * turn.size]
         assert {np.sign(values[k]) for k in at_start} == {np.sign(values[k]) for k in at_end} == {1.0, -1.0}
-
-
-def test_starts_reach_two_speeds_both_ways():
-    forward, turn = driven("starts").T
-    assert speeds(forward[turn == 0.0]) == {TOP_RAD_S, 0.5 * TOP_RAD_S}
 
 
 def test_other_names_are_refused():

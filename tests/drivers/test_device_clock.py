@@ -47,8 +47,10 @@ def run(clock, device, seconds, jitter_ns=0.0, start_ns=START_NS):
     return now_ns
 
 
-def test_knows_nothing_before_the_first_exchange():
+def test_knows_nothing_before_the_first_exchange_nor_from_a_response_before_its_request():
     clock = DeviceClock()
+    assert clock.add(2_000, 1_000, 5) is False
+    assert clock.count == 0
     assert clock.offset_ns(START_NS) is None
     assert clock.device_us(START_NS) is None
     assert not clock.synced(START_NS)
@@ -145,12 +147,6 @@ def test_one_slow_exchange_is_no_restart_and_moves_nothing():
     before = clock.offset_ns(now_ns)
     assert clock.add(now_ns, now_ns + 400_000_000, device.us(now_ns + 399_000_000)) is False
     assert abs(clock.offset_ns(now_ns + 400_000_000) - before) < 10_000
-
-
-def test_a_response_before_its_request_teaches_nothing():
-    clock = DeviceClock()
-    assert clock.add(2_000, 1_000, 5) is False
-    assert clock.count == 0
 
 
 def test_the_wrap_of_the_device_clock_is_no_restart():

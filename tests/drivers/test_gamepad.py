@@ -60,6 +60,11 @@ def device():
     made.close()
 
 
+@pytest.fixture
+def pad(device):
+    return Gamepad(device, GamepadMapping(), 0)
+
+
 def stick(code, value):
     return (ecodes.EV_ABS, code, value)
 
@@ -88,8 +93,7 @@ def test_what_is_held_at_the_start_is_known(device):
     assert state.forward == pytest.approx(1.0)
 
 
-def test_a_tap_within_one_poll_leaves_the_deadman_open(device):
-    pad = Gamepad(device, GamepadMapping(), 0)
+def test_a_tap_within_one_poll_leaves_the_deadman_open(device, pad):
     device.send(button(1), button(0))
     assert pad.poll(1).deadman is False
 
@@ -101,15 +105,13 @@ def test_the_dead_zone_is_zero_and_the_rest_begins_there(device):
         assert pad.poll(1).forward == pytest.approx(forward, abs=1e-3)
 
 
-def test_other_axes_and_buttons_are_of_no_matter(device):
-    pad = Gamepad(device, GamepadMapping(), 0)
+def test_other_axes_and_buttons_are_of_no_matter(device, pad):
     device.send(stick(ecodes.ABS_RZ, 255), button(1, ecodes.BTN_SOUTH))
     state = pad.poll(1)
     assert (state.forward, state.left, state.deadman) == (0.0, 0.0, False)
 
 
-def test_an_overrun_of_the_kernels_queue_is_made_good_from_the_device(device):
-    pad = Gamepad(device, GamepadMapping(), 0)
+def test_an_overrun_of_the_kernels_queue_is_made_good_from_the_device(device, pad):
     device.send(button(1))
     assert pad.poll(1).deadman
     # The release was lost in the overrun: only the device knows.
@@ -120,14 +122,12 @@ def test_an_overrun_of_the_kernels_queue_is_made_good_from_the_device(device):
     assert state.left == pytest.approx(1.0)
 
 
-def test_nothing_counts_between_an_overrun_and_the_next_report(device):
-    pad = Gamepad(device, GamepadMapping(), 0)
+def test_nothing_counts_between_an_overrun_and_the_next_report(device, pad):
     os.write(device.feed, EVENT.pack(0, 0, ecodes.EV_SYN, ecodes.SYN_DROPPED, 0) + EVENT.pack(0, 0, *button(1)))
     assert pad.poll(1).deadman is False
 
 
-def test_a_device_that_goes_is_noticed_and_stays_gone(device):
-    pad = Gamepad(device, GamepadMapping(), 0)
+def test_a_device_that_goes_is_noticed_and_stays_gone(device, pad):
     device.send(button(1))
     assert pad.poll(1).deadman
     device.unplug()
@@ -135,8 +135,7 @@ def test_a_device_that_goes_is_noticed_and_stays_gone(device):
     assert pad.poll(3) is None
 
 
-def test_an_error_of_the_device_is_a_device_gone(device):
-    pad = Gamepad(device, GamepadMapping(), 0)
+def test_an_error_of_the_device_is_a_device_gone(device, pad):
     device.close()
     assert pad.poll(1) is None
 

@@ -51,6 +51,19 @@ def script(request, tmp_path):
     return path
 
 
+@pytest.fixture
+def cache(tmp_path):
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def marker(script, cache, tmp_path):
+    """The file that appears when what was planted in place of the kernel in the cache is loaded."""
+    run(script, cache)
+    plant(cache, tmp_path / "ran")
+    return tmp_path / "ran"
+
+
 # Processes forked from one that has imported what is large, as each test needs several.
 FORKED = multiprocessing.get_context("forkserver")
 FORKED.set_forkserver_preload(["disco_hw.jit", "drivers.kernel_cache"])
@@ -69,9 +82,9 @@ def run_script(script, out, **environment):
     sys.stderr.flush()
 
 
-def run(script, cache, home):
+def run(script, cache):
     out = script.parents[1]
-    environment = {"NUMBA_CACHE_DIR": str(cache or ""), "HOME": str(home)}
+    environment = {"NUMBA_CACHE_DIR": str(cache or ""), "HOME": str(out)}
     process = FORKED.Process(target=run_script, args=(script, out), kwargs=environment)
     process.start()
     process.join(120.0)
@@ -87,69 +100,54 @@ def plant(cache, marker):
     index.write_bytes(pickle.dumps(Bomb(marker)))
 
 
-def test_a_kernel_is_loaded_from_a_directory_of_ones_own(script, tmp_path):
-    cache = tmp_path / "cache"
-    assert run(script, cache, tmp_path) == (False, "")
+def test_a_kernel_is_loaded_from_a_directory_of_ones_own(script, cache):
+    assert run(script, cache) == (False, "")
     assert {path.stat().st_mode & 0o777 for path in cache.iterdir()} == {0o700}
-    assert run(script, cache, tmp_path) == (True, "")
+    assert run(script, cache) == (True, "")
 
 
-def test_what_another_version_kept_there_is_compiled_anew(script, tmp_path):
-    cache = tmp_path / "cache"
-    run(script, cache, tmp_path)
+def test_what_another_version_kept_there_is_compiled_anew(script, cache):
+    run(script, cache)
     (index,) = cache.rglob("*twice*.nbi")
     version = pickle.loads(index.read_bytes())
     assert version == numba.__version__
     # A type that has moved: what a model's coefficients are, say.
     index.write_bytes(pickle.dumps(version) + b"cdisco_hw.gone\nEffects\n.")
-    assert run(script, cache, tmp_path) == (False, "")
-    assert run(script, cache, tmp_path) == (True, "")
+    assert run(script, cache) == (False, "")
+    assert run(script, cache) == (True, "")
 
 
-def test_a_planted_pickle_would_run_if_it_were_loaded(script, tmp_path):
+def test_a_planted_pickle_would_run_if_it_were_loaded(script, cache, marker):
     # What shows that the other tests can fail: in a directory of one's own numba loads what it finds.
-    cache, marker = tmp_path / "cache", tmp_path / "ran"
-    run(script, cache, tmp_path)
-    plant(cache, marker)
-    run(script, cache, tmp_path)
+    run(script, cache)
     assert marker.exists()
 
 
 @pytest.mark.parametrize("script", KERNELS, indirect=True)
 @pytest.mark.parametrize("opened", ["the directory named", "the directory of the module"])
-def test_a_pickle_in_a_directory_that_others_can_write_to_is_not_run(script, tmp_path, opened):
-    cache, marker, home = tmp_path / "cache", tmp_path / "ran", tmp_path / "home"
-    home.mkdir()
-    run(script, cache, home)
-    plant(cache, marker)
+def test_a_pickle_in_a_directory_that_others_can_write_to_is_not_run(script, cache, marker, opened):
     place = cache if opened == "the directory named" else next(cache.iterdir())
     place.chmod(0o777)
-    loaded, reported = run(script, cache, home)
+    loaded, reported = run(script, cache)
     assert not loaded
     assert reported == f"disco-hw: {place}: others can write to it; kernels there are not loaded but compiled again\n"
     assert not marker.exists()
     # It is kept in the next directory, which is this user's alone.
-    assert run(script, cache, home)[0]
+    assert run(script, cache)[0]
     assert not marker.exists()
 
 
-def test_a_pickle_that_others_can_write_is_not_run_though_its_directory_is_ones_own(script, tmp_path):
-    cache, marker = tmp_path / "cache", tmp_path / "ran"
-    run(script, cache, tmp_path)
-    plant(cache, marker)
+def test_a_pickle_that_others_can_write_is_not_run_though_its_directory_is_ones_own(script, cache, marker):
     next(cache.rglob("*.nbi")).chmod(0o666)
-    assert "not loaded but compiled again" in run(script, cache, tmp_path)[1]
+    assert "not loaded but compiled again" in run(script, cache)[1]
     assert not marker.exists()
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root to give a directory to another user")
-def test_a_pickle_of_another_user_is_not_run(script, tmp_path):
-    cache, marker = tmp_path / "cache", tmp_path / "ran"
-    run(script, cache, tmp_path)
-    plant(cache, marker)
+def test_a_pickle_of_another_user_is_not_run(script, cache, marker):
     for path in (next(cache.rglob("*.nbi")), next(cache.iterdir())):
         os.chown(path, NOBODY, NOBODY)
-        loaded, reported = run(script, cache, tmp_path)
+        loaded, reported = run(script, cache)
         assert not loaded or path.is_dir()
         assert f"{path}: belongs to nobody (65534)" in reported
         assert not marker.exists()
@@ -157,16 +155,14 @@ def test_a_pickle_of_another_user_is_not_run(script, tmp_path):
 
 
 def test_a_pickle_beside_the_source_is_not_run_either_and_where_none_is_private_nothing_is_kept(script, tmp_path):
-    marker, home = tmp_path / "ran", tmp_path / "home"
-    home.mkdir()
-    run(script, None, home)
-    cache_folder = script.parent / "__pycache__"
-    plant(cache_folder, marker)
-    cache_folder.chmod(0o777)
-    assert str(cache_folder) in run(script, None, home)[1]
-    (module,) = (home / ".cache" / "numba").iterdir()
+    marker, beside = tmp_path / "ran", script.parent / "__pycache__"
+    run(script, None)
+    plant(beside, marker)
+    beside.chmod(0o777)
+    assert str(beside) in run(script, None)[1]
+    (module,) = (tmp_path / ".cache" / "numba").iterdir()
     module.chmod(0o777)
-    loaded, reported = run(script, None, home)
+    loaded, reported = run(script, None)
     assert not loaded
     assert "kernels are compiled again in each process" in reported
     assert not marker.exists()

@@ -53,12 +53,9 @@ def test_the_key_of_another_user_is_refused(tmp_path, monkeypatch):
 ME = os.geteuid()
 
 
-def test_a_directory_of_ones_own_is_private(tmp_path):
+def test_a_directory_is_private_to_its_owner_who_is_named_to_others(tmp_path):
     tmp_path.chmod(0o755)
     assert why_not_private(tmp_path, {ME}) is None
-
-
-def test_a_directory_of_another_user_is_reported_with_its_owner(tmp_path):
     assert why_not_private(tmp_path, {ME + 1}) == f"belongs to {user_name(ME)}"
     assert user_name(0) == "root (0)"
     assert user_name(4_000_000) == "user 4000000"

@@ -49,6 +49,18 @@ def collect(transport, count, timeout_s=10.0):
     return received
 
 
+def receive_until(source, enough):
+    """Poses and messages of a pose source until `enough(poses, messages)`, within a generous time."""
+    found, messages = [], []
+    end_s = time.monotonic() + 60.0
+    while not enough(found, messages):
+        assert time.monotonic() < end_s, (found, messages)
+        found += source.receive(time.monotonic_ns(), ())
+        messages += source.new_messages()
+        time.sleep(0.01)
+    return found, messages
+
+
 def median_send_s(transport):
     """Return how long `send` keeps its caller, over fifty frames that are soon too old to be sent."""
     durations = []

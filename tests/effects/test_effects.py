@@ -10,6 +10,7 @@ from disco_hw.effects import Channel, encoder_scale, heading_bias, pose_latency,
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model import EffectSetting, Model, plain
 from disco_hw.model.step import FreeRun
+from tests.model.reference import reference_run
 from tools.compile_kernels import model_with_every_effect
 
 NAMES = {
@@ -31,19 +32,20 @@ STEP_S = 0.1
 def free_run(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0):
     # All effects are there, the others at their neutral values: neutral must be neutral.
     model = model_with_every_effect(effects, BASE)
-    past = np.zeros((3, 2))
     run = FreeRun(model, model.point()[None], STEP_S)
-    return run.states(np.array(start), np.vstack([past, commands]), 3, time_s)
+    return run.states(np.array(start), np.vstack([np.zeros((3, 2)), commands]), 3, time_s)
 
 
-def by_reference(effects, commands, start=(0.0, 0.0, 0.0, 0.0, 0.0), time_s=0.0):
+def added_by(name, values, commands):
+    """How much an effect adds to each state of a run."""
+    return free_run({name: values}, commands) - free_run({}, commands)
+
+
+def by_reference(effects, commands, time_s=0.0):
     model = Model(*BASE, effects=tuple(EffectSetting(name, values) for name, values in effects.items()))
     theta = plain.theta_of(model.parameter_names, model.point())
     in_force = plain.delayed(np.vstack([np.zeros((3, 2)), commands]), 3, theta, STEP_S)
-    states = [plain.RobotState(*start)]
-    for t, (left, right) in enumerate(in_force):
-        states.append(plain.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
-    return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])
+    return reference_run(model, in_force, STEP_S, time_s=time_s)
 
 
 STRAIGHT = np.full((20, 2), 4.0)
@@ -161,16 +163,14 @@ def built_up(commands, **values):
     return 0.5 * (wheels[:, 1] - wheels[:, 0]), wheels.mean(axis=1)
 
 
-def test_turning_builds_up_slowly_and_falls_at_once():
+def test_turning_builds_up_slowly_from_what_is_there_at_once_and_falls_at_once():
     half, mean = built_up([[-1.0, 3.0]] * 6 + [[1.0, 1.0]] * 2 + [[3.0, -1.0]] * 3)
     assert half == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.0, 0.0, -0.1, -0.2, -0.3])
     assert mean == pytest.approx([1.0] * 11)
     # Turning the other way begins from none.
     half, _ = built_up([[-1.0, 1.0]] * 5 + [[1.0, -1.0]] * 2)
     assert half[4:] == pytest.approx([0.5, -0.1, -0.2])
-
-
-def test_turning_is_there_at_once_up_to_what_it_says():
+    # Up to this it is there at once.
     half, _ = built_up([[-2.0, 2.0]] * 3, at_once_rad_s=0.7)
     assert half == pytest.approx([0.8, 0.9, 1.0])
     half, _ = built_up([[-0.5, 0.5]] * 3, at_once_rad_s=0.7)
@@ -180,7 +180,6 @@ def test_turning_is_there_at_once_up_to_what_it_says():
 def test_motors_that_give_all_to_a_turn_leave_the_mean_behind_by_what_the_turn_lacks():
     half, mean = built_up([[-0.5, 2.5]] * 8, shared=1.0)
     assert half == pytest.approx(0.1 * np.arange(1, 9))
-
     assert mean == pytest.approx([0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.3])
 
 
@@ -227,11 +226,9 @@ def test_yaw_acceleration_limit_comes_after_the_motors_lag():
 
 
 def test_stiction_holds_a_wheel_at_rest_but_not_a_turning_one():
-    weak = np.full((10, 2), 0.5)
-    stuck = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak)
-    turning = free_run({"stiction": {"threshold_rad_s": 0.7}}, weak, start=(0.0, 0.0, 0.0, 2.0, 2.0))
-    assert stuck[-1, 3] == 0.0
-    assert turning[-1, 3] == pytest.approx(0.5)
+    effect, weak = {"stiction": {"threshold_rad_s": 0.7}}, np.full((10, 2), 0.5)
+    assert free_run(effect, weak)[-1, 3] == 0.0
+    assert free_run(effect, weak, start=(0.0, 0.0, 0.0, 2.0, 2.0))[-1, 3] == pytest.approx(0.5)
 
 
 def test_body_effects_act_on_the_velocities_they_name():
@@ -240,11 +237,9 @@ def test_body_effects_act_on_the_velocities_they_name():
     omega = 0.06 * 8.0 / 0.4
     assert free_run({"turn_slip": {"k_s": 0.1}}, SPIN)[-1, 2] == pytest.approx(omega * (1.0 - 0.1 * omega) * 2.0)
     assert free_run({"turn_slip": {"k_s": 2.0}}, SPIN)[-1, 2] == pytest.approx(omega)
-    first = free_run({"lateral_icr": {"offset_m": 0.05}}, SPIN)[1]
-    plain = free_run({}, SPIN)[1]
-    assert first[0] - plain[0] == pytest.approx(0.05 * math.sin(omega * 0.1))
+    assert added_by("lateral_icr", {"offset_m": 0.05}, SPIN)[1, 0] == pytest.approx(0.05 * math.sin(omega * 0.1))
     half = 0.06 * 3.0 / 0.4 / 2.0 * 0.1
-    slid = free_run({"side_slip": {"k_s": 0.2}}, TURN)[1, :2] - free_run({}, TURN)[1, :2]
+    slid = added_by("side_slip", {"k_s": 0.2}, TURN)[1]
     across = -slid[0] * math.sin(half) + slid[1] * math.cos(half)
     assert across == pytest.approx(-0.2 * (0.06 * 3.5) * (0.06 * 3.0 / 0.4) * 0.1, rel=1e-3)
     slipping = free_run({"acceleration_slip": {"k_s2_m": 0.1}}, STRAIGHT)
@@ -256,8 +251,7 @@ def test_body_effects_act_on_the_velocities_they_name():
 def test_a_slope_moves_only_a_robot_whose_wheels_turn():
     values = {"slope": {"drift_x_m_s": 0.02, "drift_y_m_s": 0.01}}
     np.testing.assert_array_equal(free_run(values, np.zeros((10, 2)))[-1, :2], [0.0, 0.0])
-    moved = free_run(values, STRAIGHT)[-1, :2] - free_run({}, STRAIGHT)[-1, :2]
-    np.testing.assert_allclose(moved, [0.04, 0.02], atol=1e-12)
+    np.testing.assert_allclose(added_by("slope", values["slope"], STRAIGHT)[-1, :2], [0.04, 0.02], atol=1e-12)
 
 
 def test_a_robot_turns_about_another_point_to_the_left_than_to_the_right():
@@ -267,33 +261,40 @@ def test_a_robot_turns_about_another_point_to_the_left_than_to_the_right():
         turned, plainly = free_run(values, spin)[-1], free_run({}, spin)[-1]
         assert turned[1] - plainly[1] == pytest.approx(0.05 * abs(turned[2]), rel=0.01)
         assert turned[2] == plainly[2]
-    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
 
 
 def test_a_robot_that_speeds_up_in_a_turn_is_carried_aside_and_one_at_a_steady_speed_is_not():
-    values = {"load_transfer": {"k_s2": 0.3}}
-    np.testing.assert_allclose(
-        free_run(values, TURN)[2:], free_run({}, TURN)[2:] + (free_run(values, TURN) - free_run({}, TURN))[1]
-    )
-    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
+    added = added_by("load_transfer", {"k_s2": 0.3}, TURN)
+    np.testing.assert_allclose(added[2:], np.tile(added[1], (19, 1)), rtol=1e-7, atol=1e-12)
 
 
-def test_an_uneven_grip_turns_further_one_way_and_leaves_straights_alone():
+def test_an_uneven_grip_turns_further_one_way():
     values = {"turn_asymmetry": {"share": 0.1}}
-    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
     plainly = free_run({}, SPIN)[-1, 2]
     assert free_run(values, SPIN)[-1, 2] == pytest.approx(1.1 * plainly)
     assert free_run(values, -SPIN)[-1, 2] == pytest.approx(-0.9 * plainly)
 
 
-def test_a_turning_robot_slides_downhill_as_fast_as_it_turns_and_a_straight_one_holds():
+def test_a_turning_robot_slides_downhill_as_fast_as_it_turns():
     values = {"downhill_slide": {"slide_x_m": 0.1, "slide_y_m": 0.05}}
-    np.testing.assert_array_equal(free_run(values, STRAIGHT), free_run({}, STRAIGHT))
     for direction in (1.0, -1.0):
         turned, plainly = free_run(values, direction * SPIN), free_run({}, direction * SPIN)
         np.testing.assert_allclose(turned[:, 2], plainly[:, 2])
         slid = abs(turned[-1, 2])
         np.testing.assert_allclose((turned - plainly)[-1, :2], [0.1 * slid, 0.05 * slid], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("turning_point", {"ahead_m": 0.05}),
+        ("load_transfer", {"k_s2": 0.3}),
+        ("turn_asymmetry", {"share": 0.1}),
+        ("downhill_slide", {"slide_x_m": 0.1, "slide_y_m": 0.05}),
+    ],
+)
+def test_what_acts_in_turns_leaves_straights_alone(name, values):
+    np.testing.assert_array_equal(added_by(name, values, STRAIGHT), 0.0)
 
 
 def test_a_surface_changes_at_its_time():

@@ -132,11 +132,19 @@ def test_outliers_that_disagree_never_move_the_belief():
     assert after.candidate_count == 1
 
 
-def test_fewer_agreeing_outliers_than_the_count_do_not_move_the_belief():
-    pose_filter, state = initialised()
-    jumped = [(0.5, 0.0, 0.0)] * 4
-    _, reasons = reasons_of(pose_filter, state, [*jumped, (0.0, 0.0, 0.0), *jumped, (0.0, 0.0, 0.0)])
-    assert reasons == ([PoseReason.GATED] * 4 + [PoseReason.ACCEPTED]) * 2
+AGREED, JUMPED, STRAY = (0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("poses", "expected"),
+    [
+        (([JUMPED] * 4 + [AGREED]) * 2, ([PoseReason.GATED] * 4 + [PoseReason.ACCEPTED]) * 2),
+        ([JUMPED] * 4 + [STRAY] + [JUMPED] * 5, [PoseReason.GATED] * 9 + [PoseReason.REINITIALISED]),
+    ],
+    ids=["a pose in between that agrees with the belief", "an outlier in between that disagrees"],
+)
+def test_fewer_agreeing_outliers_in_a_row_than_the_count_do_not_move_the_belief(poses, expected):
+    assert reasons_of(*initialised(), poses)[1] == expected
 
 
 def test_agreeing_outliers_in_a_row_move_it_to_where_they_are():
@@ -151,13 +159,6 @@ def test_agreeing_outliers_in_a_row_move_it_to_where_they_are():
     # At the mean of the five, which is better than any one of them.
     np.testing.assert_allclose([after.belief.x_m, after.belief.y_m], np.mean(poses, axis=0)[:2], atol=1e-4)
     assert math.sqrt(after.belief.xx) == pytest.approx(0.01 / math.sqrt(5), rel=0.01)
-
-
-def test_an_outlier_that_disagrees_starts_the_count_anew():
-    pose_filter, state = initialised()
-    jumped, stray = (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0)
-    _, reasons = reasons_of(pose_filter, state, [jumped] * 4 + [stray] + [jumped] * 5)
-    assert reasons == [PoseReason.GATED] * 9 + [PoseReason.REINITIALISED]
 
 
 def test_agreement_is_judged_with_the_motion_in_between():

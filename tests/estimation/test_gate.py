@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from disco_hw.estimation.correction import PoseReason, gate_limit, screen
+from disco_hw.estimation.odometry import Pose
 from drivers.types import PoseSample
 
 GOOD = PoseSample(t_ns=5, received_ns=7, x_m=1.0, y_m=-2.0, yaw_rad=3.0, position_std_m=0.01, yaw_std_rad=0.02)
@@ -23,12 +24,7 @@ def test_the_limit_is_the_quantile_of_chi_square_with_three_degrees(probability)
 
 def test_a_good_sample_keeps_its_values():
     measurement = screen(GOOD)
-    assert (measurement.t_ns, measurement.pose.x_m, measurement.pose.y_m, measurement.pose.yaw_rad) == (
-        5,
-        1.0,
-        -2.0,
-        3.0,
-    )
+    assert (measurement.t_ns, measurement.pose) == (5, Pose(1.0, -2.0, 3.0))
     assert measurement.position_variance == pytest.approx(1e-4)
     assert measurement.yaw_variance == pytest.approx(4e-4)
     assert not measurement.floored
@@ -47,11 +43,9 @@ def test_absurd_values_are_refused(fields):
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1e-12])
 def test_unusable_standard_deviations_are_raised_to_the_floor(value):
-    position = changed(position_std_m=value)
-    assert position.position_variance == pytest.approx(1e-6)
+    position, yaw = changed(position_std_m=value), changed(yaw_std_rad=value)
+    assert (position.position_variance, yaw.yaw_variance) == pytest.approx((1e-6, 1e-6))
     assert position.floored
-    yaw = changed(yaw_std_rad=value)
-    assert yaw.yaw_variance == pytest.approx(1e-6)
     assert yaw.floored
 
 

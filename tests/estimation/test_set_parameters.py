@@ -18,13 +18,20 @@ def wheels(tick, speed=4.0):
     return WheelSample(t_ns, t_ns, 0.02 * speed * tick, 0.02 * speed * tick, speed, speed)
 
 
-def driven(ticks=100):
-    fusion = PoseFusion(Estimation(), OLD, 0.05)
-    for tick in range(ticks):
+def pose(tick, came_tick, x_m=0.0, y_m=0.0):
+    return PoseSample(tick * TICK_NS, came_tick * TICK_NS, x_m, y_m, 0.0, 0.005, 0.01)
+
+
+def drive(fusion, first, last):
+    for tick in range(first, last):
         fusion.add_wheels(wheels(tick))
         if tick == 5:
-            fusion.add_pose(PoseSample(tick * TICK_NS, tick * TICK_NS, 0.0, 0.0, 0.0, 0.005, 0.01), tick * TICK_NS)
+            fusion.add_pose(pose(tick, tick), tick * TICK_NS)
     return fusion
+
+
+def driven():
+    return drive(PoseFusion(Estimation(), OLD, 0.05), 0, 100)
 
 
 def test_the_estimate_does_not_jump():
@@ -41,9 +48,7 @@ def test_the_way_from_there_on_is_by_the_new_geometry():
     fusion = driven()
     x_m = fusion.estimate(99 * TICK_NS).x_m
     fusion.set_parameters(NEW)
-    for tick in range(100, 150):
-        fusion.add_wheels(wheels(tick))
-    later = fusion.estimate(149 * TICK_NS)
+    later = drive(fusion, 100, 150).estimate(149 * TICK_NS)
     assert later.x_m - x_m == pytest.approx(0.07 * 4.0, rel=1e-6)
     assert later.speed_m_s == pytest.approx(0.28)
 
@@ -54,17 +59,14 @@ def test_uncertainty_grows_by_the_new_one():
     grown = []
     for fusion in (old, new):
         before = fusion.estimate(99 * TICK_NS).covariance[0][0]
-        for tick in range(100, 150):
-            fusion.add_wheels(wheels(tick))
-        grown.append(fusion.estimate(149 * TICK_NS).covariance[0][0] - before)
+        grown.append(drive(fusion, 100, 150).estimate(149 * TICK_NS).covariance[0][0] - before)
     assert grown[1] < 0.2 * grown[0]
 
 
 def test_a_pose_from_before_the_change_is_still_taken_in():
     fusion = driven()
     fusion.set_parameters(NEW)
-    update = fusion.add_pose(PoseSample(80 * TICK_NS, 99 * TICK_NS, 0.36, 0.0, 0.0, 0.005, 0.01), 99 * TICK_NS)
-    assert update.accepted
+    assert fusion.add_pose(pose(80, 99, 0.36), 99 * TICK_NS).accepted
 
 
 def test_adopting_late_is_adopting_at_once_bit_for_bit():
@@ -80,10 +82,7 @@ def test_adopting_late_is_adopting_at_once_bit_for_bit():
                     buffer._states, buffer._before = [buffer._filter.adopt(state) for state in buffer._states], 0
             fusion.add_wheels(wheels(tick))
             if tick % 3 == 0:
-                sample_ns = (tick - 15) * TICK_NS
-                fusion.add_pose(
-                    PoseSample(sample_ns, tick * TICK_NS, 0.004 * tick, 0.01, 0.0, 0.005, 0.01), tick * TICK_NS
-                )
+                fusion.add_pose(pose(tick - 15, tick, 0.004 * tick, 0.01), tick * TICK_NS)
             estimates.append(fusion.estimate(tick * TICK_NS))
         return estimates
 

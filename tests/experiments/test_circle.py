@@ -3,7 +3,6 @@
 import csv
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +10,10 @@ import pytest
 from disco_hw.control.plan import ROTATION
 from disco_hw.errors import InputError
 from disco_hw.experiments.circle import CURVES, CircleOptions, CircleResult, Run, drive, plants, run_circle
-from disco_hw.model import Gaussian, load_model
+from disco_hw.model import Gaussian
 from disco_hw.tasks.circle import CircleCost
 from tests.tasks.costs import instant_cost
-
-MODEL = load_model(Path(__file__).parents[2] / "disco_hw/robots/wombot_model.toml")
-MEAN = {"wheel_radius_m": 0.061, "axial_distance_m": 0.415, "x_icr_m": 0.238}
+from tests.tasks.drives import MEAN, MODEL
 
 
 def standing(place, count=40, commands=None):
@@ -95,9 +92,8 @@ def test_a_robot_without_commands_stands_at_the_cost_of_standing():
 def short():
     # Bounded acceleration, as a real robot's: its planner is compiled already.
     reported = []
-    return run_circle(
-        MODEL, "default", CircleOptions(seeds=8, duration_s=6.0, largest_rot_s2=3.0), reported.append
-    ), reported
+    options = CircleOptions(seeds=8, duration_s=6.0, largest_rot_s2=3.0)
+    return run_circle(MODEL, "default", options, reported.append), reported
 
 
 @pytest.mark.thorough

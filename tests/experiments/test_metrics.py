@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
-from disco_hw.experiments.circle_report import Path, circle_figures, estimation_figures
+from disco_hw.errors import WorkError
+from disco_hw.experiments.circle_report import Path, circle_figures, estimation_figures, load_circle_report
 from disco_hw.tasks.circle import CircleTask
+from tools.log_samples import drive_ticks, write_log
 
 TASK = CircleTask()
 
@@ -20,6 +24,10 @@ def circle(radius: float = 0.75, speed: float = 0.2, laps: float = 1.5, n: int =
         yaw_rad=(angle + np.pi / 2 + np.pi) % (2 * np.pi) - np.pi,
         speed_m_s=np.full(n, speed),
     )
+
+
+def columns_of(path: Path) -> list[np.ndarray]:
+    return [getattr(path, field.name) for field in fields(path)]
 
 
 def test_the_perfect_circle_costs_nothing():
@@ -37,33 +45,22 @@ def test_a_wider_and_slower_circle_shows_both_errors():
 
 def test_settled_figures_leave_out_the_first_quarter_lap():
     good, start = circle(laps=1.0, n=401), circle(radius=1.75, laps=0.2, n=11)
-    both = Path(
-        t_s=np.concatenate([start.t_s, start.t_s[-1] + 1.0 + good.t_s]),
-        x_m=np.concatenate([start.x_m, good.x_m]),
-        y_m=np.concatenate([start.y_m, good.y_m]),
-        yaw_rad=np.concatenate([start.yaw_rad, good.yaw_rad]),
-        speed_m_s=np.concatenate([start.speed_m_s, good.speed_m_s]),
-    )
-    figures = circle_figures(both, TASK)
+    later = replace(good, t_s=start.t_s[-1] + 1.0 + good.t_s)
+    both = [np.concatenate(columns) for columns in zip(columns_of(start), columns_of(later), strict=True)]
+    figures = circle_figures(Path(*both), TASK)
     assert figures.rms_distance_m > 0.1
     assert figures.settled_rms_distance_m == pytest.approx(0.0, abs=1e-12)
 
 
 def test_driving_backwards_counts_negative_laps():
     path = circle()
-    mirrored = Path(path.t_s, path.x_m, -path.y_m, -path.yaw_rad, path.speed_m_s)
-    assert circle_figures(mirrored, TASK).laps == pytest.approx(-1.5)
+    assert circle_figures(replace(path, y_m=-path.y_m, yaw_rad=-path.yaw_rad), TASK).laps == pytest.approx(-1.5)
 
 
 def test_estimation_error_survives_the_wrap_of_yaw_and_other_sample_times():
     truth = circle()
-    shifted = Path(
-        truth.t_s[5:-5:7],
-        truth.x_m[5:-5:7] + 0.03,
-        truth.y_m[5:-5:7] - 0.04,
-        truth.yaw_rad[5:-5:7] + 0.01,
-        truth.speed_m_s[5:-5:7],
-    )
+    some = Path(*(column[5:-5:7] for column in columns_of(truth)))
+    shifted = replace(some, x_m=some.x_m + 0.03, y_m=some.y_m - 0.04, yaw_rad=some.yaw_rad + 0.01)
     figures = estimation_figures(shifted, truth)
     assert figures.rms_position_m == pytest.approx(0.05, rel=1e-6)
     assert figures.rms_yaw_rad == pytest.approx(0.01, rel=1e-6)
@@ -71,6 +68,12 @@ def test_estimation_error_survives_the_wrap_of_yaw_and_other_sample_times():
 
 def test_no_common_time_is_refused():
     path = circle()
-    shifted = Path(path.t_s + 1e6, path.x_m, path.y_m, path.yaw_rad, path.speed_m_s)
     with pytest.raises(ValueError, match="in common"):
-        estimation_figures(shifted, path)
+        estimation_figures(replace(path, t_s=path.t_s + 1e6), path)
+
+
+def test_a_log_that_is_continued_by_another_file_is_not_taken_for_the_whole_drive(tmp_path):
+    log = tmp_path / "demo.mcap"
+    write_log(log, drive_ticks(50))
+    with pytest.raises(WorkError, match=r"demo\.mcap: ends before the drive did, .* drive again"):
+        load_circle_report(log, tmp_path / "truth.csv", CircleTask(), 0.5, stopped=True)

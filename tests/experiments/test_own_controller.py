@@ -28,25 +28,15 @@ PAGE = ROOT / "docs" / "my-controller.md"
 ROBOT = ROOT / "disco_hw" / "robots" / "wombot.toml"
 
 
-def program(number):
-    return re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE)[number]
-
-
-def printed(number):
-    return re.findall(r"^```text\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE)[number]
+def block(kind, number):
+    """One of the page's blocks of code of a kind."""
+    return re.findall(rf"^```{kind}\n(.*?)^```", PAGE.read_text("utf-8"), re.DOTALL | re.MULTILINE)[number]
 
 
 def run(text, directory):
     environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{directory}"}
-    done = subprocess.run(
-        [sys.executable, "-c", text],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=900,
-        check=False,
-    )
+    command = [sys.executable, "-c", text]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -65,15 +55,15 @@ def agree(documented, measured):
 def test_the_pages_law_drives_the_circle_as_the_page_says():
     output = StringIO()
     with redirect_stdout(output):
-        exec(compile(program(0), PAGE, "exec"), {"__name__": "__main__"})
-    agree(figures(printed(0)), figures(output.getvalue()))
+        exec(compile(block("python", 0), PAGE, "exec"), {"__name__": "__main__"})
+    agree(figures(block("text", 0)), figures(output.getvalue()))
 
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
 def test_the_pages_comparison_with_disco_is_as_it_says(tmp_path):
-    (tmp_path / "my_controller.py").write_text(program(0), encoding="utf-8")
-    agree(figures(printed(1)), figures(run(program(1), tmp_path)))
+    (tmp_path / "my_controller.py").write_text(block("python", 0), encoding="utf-8")
+    agree(figures(block("text", 1)), figures(run(block("python", 1), tmp_path)))
 
 
 @thinned("rate_hz", [20, 33, 60, 100], quick=2)

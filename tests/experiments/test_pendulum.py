@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 
 from disco_hw.control import pendulum
-from disco_hw.experiments.pendulum import (
-    CURVES,
-    POSTERIOR,
-    PRIOR,
-    PendulumOptions,
-    PendulumResult,
-    run_pendulum,
-)
+from disco_hw.experiments.pendulum import CURVES, POSTERIOR, PRIOR, PendulumOptions, PendulumResult, run_pendulum
 
 
 def test_the_experiment_is_the_papers():
@@ -68,17 +61,12 @@ def test_what_it_knows_of_the_mean_matters_and_what_it_knows_of_the_spread_does_
 
 
 @pytest.mark.thorough
-def test_seeds_repeat(swings):
+def test_seeds_repeat_and_an_offset_goes_on_where_other_seeds_ended(swings):
     result, _ = swings
     again = run_pendulum(PendulumOptions(seeds=1, steps=15))
     for name in CURVES:
         np.testing.assert_array_equal(again.costs[name], result.costs[name][:1, :15])
         assert not np.array_equal(result.costs[name][0], result.costs[name][1])
-
-
-@pytest.mark.thorough
-def test_an_offset_goes_on_where_other_seeds_ended(swings):
-    result, _ = swings
     last = run_pendulum(PendulumOptions(seeds=1, steps=15, seed_offset=2))
     np.testing.assert_array_equal(last.costs["MC, posterior"], result.costs["MC, posterior"][2:, :15])
 

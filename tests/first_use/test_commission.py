@@ -22,6 +22,12 @@ FARTHEST_M = 0.3
 COARSE_US = 5000
 
 
+@pytest.fixture
+def path(tmp_path):
+    """A robot.toml of the reference controller."""
+    return robot_file(tmp_path)
+
+
 def in_millimetres(x, y, yaw):
     return 1e3 * x, 1e3 * y, yaw
 
@@ -107,10 +113,8 @@ def check_near(run, name):
     for command, true in run.where:
         left, right = (0.0, 0.0) if command is None else (command.left_rad_s, command.right_rad_s)
         assert max(abs(left), abs(right)) <= 1.01 * run.slow_rad_s
-        v, w = (
-            0.5 * plant.wheel_radius_m * (left + right),
-            plant.wheel_radius_m * (right - left) / plant.axial_distance_m,
-        )
+        v = 0.5 * plant.wheel_radius_m * (left + right)
+        w = plant.wheel_radius_m * (right - left) / plant.axial_distance_m
         slip = w * plant.x_icr_m
         x += 0.02 * (v * math.cos(yaw) + slip * math.sin(yaw))
         y += 0.02 * (v * math.sin(yaw) - slip * math.cos(yaw))
@@ -124,8 +128,7 @@ def test_a_fault_is_found_named_and_mended(tmp_path, name, driver, wrong):
     assert commissioned(robot_file(tmp_path, driver), WRONG[wrong], (name,), step_us=COARSE_US) == [wrong]
 
 
-def test_a_pose_wrong_in_every_way_is_mended_at_once(tmp_path):
-    path = robot_file(tmp_path)
+def test_a_pose_wrong_in_every_way_is_mended_at_once(path):
     evaluation, run = evaluated(path, "floor", Miswiring(pose=wrong_in_every_way), step_us=COARSE_US)
     check_near(run, "floor")
     assert write_fields(CommissionOptions(path, write=True), evaluation.edits)
@@ -163,8 +166,8 @@ def assert_driven_to_the_end(run):
 
 # The robot whose watchdog is off is on blocks, too.
 @pytest.mark.parametrize("name", ["sides", pytest.param("turns", marks=pytest.mark.thorough)])
-def test_a_robot_on_blocks_is_driven_to_the_end_though_its_poses_stand_still(tmp_path, name):
-    evaluation, run = evaluated(robot_file(tmp_path), name, Miswiring(pose=lifted), step_us=COARSE_US)
+def test_a_robot_on_blocks_is_driven_to_the_end_though_its_poses_stand_still(path, name):
+    evaluation, run = evaluated(path, name, Miswiring(pose=lifted), step_us=COARSE_US)
     assert not evaluation.faults
     assert_driven_to_the_end(run)
 
@@ -195,16 +198,12 @@ def sound(number):
     return plant, effects
 
 
-def sound_stages(tmp_path, number, driver):
-    plant, effects = sound(number)
-    return commissioned(robot_file(tmp_path, driver), Miswiring(), plant=plant, effects=effects, seed=number)
-
-
 @pytest.mark.long
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("number", range(20))
 def test_twenty_sound_robots_have_no_fault(tmp_path, number):
-    assert sound_stages(tmp_path, number, DRIVERS[number % len(DRIVERS)]) == []
+    path, (plant, effects) = robot_file(tmp_path, DRIVERS[number % len(DRIVERS)]), sound(number)
+    assert commissioned(path, Miswiring(), plant=plant, effects=effects, seed=number) == []
 
 
 @pytest.mark.long
@@ -216,12 +215,11 @@ def test_every_fault_is_found_with_every_driver(tmp_path, driver, wrong):
 
 
 @pytest.mark.long
-def test_axes_of_north_and_east_are_two_faults_for_each_is_a_field_of_its_own(tmp_path):
-    found = commissioned(robot_file(tmp_path), Miswiring(pose=north_and_east))
-    assert found == ["yaw the other way round", "axes mirrored"]
+def test_axes_of_north_and_east_are_two_faults_for_each_is_a_field_of_its_own(path):
+    assert commissioned(path, Miswiring(pose=north_and_east)) == ["yaw the other way round", "axes mirrored"]
 
 
-def test_who_holds_a_key_that_does_not_count_is_told_once(tmp_path):
+def test_who_holds_a_key_that_does_not_count_is_told_once(path):
     class Idle:
         ended = None
 
@@ -230,7 +228,7 @@ def test_who_holds_a_key_that_does_not_count_is_told_once(tmp_path):
 
     ineffective = [False, True, True, False, True]
     readings = iter(ineffective)
-    procedure = Procedure(STAGES[0].steps(load_setup(robot_file(tmp_path)).config.robot, 0.0))
+    procedure = Procedure(STAGES[0].steps(load_setup(path).config.robot, 0.0))
     pilot = CommissionPilot(procedure, Idle(), str, lambda: next(readings))
     messages = [
         [text for text in pilot.step(k, None).events if "release all keys" in text] for k in range(len(ineffective))
@@ -238,42 +236,41 @@ def test_who_holds_a_key_that_does_not_count_is_told_once(tmp_path):
     assert list(map(len, messages)) == [0, 1, 0, 0, 1]
 
 
-def test_what_would_be_refused_is_not_written(tmp_path):
-    path = robot_file(tmp_path)
+SWAPPED = {("wheels", "sides_swapped"): True}
+
+
+def test_nothing_is_written_without_a_yes_or_of_what_would_be_refused(path):
     before = path.read_text(encoding="utf-8")
+    assert not write_fields(CommissionOptions(path), SWAPPED, ask=lambda _prompt: "")
     with pytest.raises(WorkError, match="not changed"):
         write_fields(CommissionOptions(path, write=True), {("wheels", "turn_ratio"): -1.0})
     assert path.read_text(encoding="utf-8") == before
 
 
-def test_the_file_of_before_is_kept_byte_for_byte(tmp_path):
-    path = robot_file(tmp_path)
+def test_the_file_of_before_is_kept_byte_for_byte(path):
     before = path.read_bytes().replace(b"\n", b"\r\n")
     path.write_bytes(before)
-    assert write_fields(CommissionOptions(path, write=True), {("wheels", "sides_swapped"): True})
+    assert write_fields(CommissionOptions(path, write=True), SWAPPED)
     assert path.with_name(f"{path.name}.before").read_bytes() == before
     assert load_setup(path).config.wheels.sides_swapped
 
 
-def test_a_place_that_cannot_be_written_is_one_line_and_leaves_robot_toml(tmp_path):
-    path = robot_file(tmp_path)
+def test_a_place_that_cannot_be_written_is_one_line_and_leaves_robot_toml(tmp_path, path):
     before = path.read_bytes()
     path.with_name(f"{path.name}.before").mkdir()
     there = sorted(tmp_path.iterdir())
     with pytest.raises(WorkError, match=r"not changed \(Is a directory\)"):
-        write_fields(CommissionOptions(path, write=True), {("wheels", "sides_swapped"): True})
+        write_fields(CommissionOptions(path, write=True), SWAPPED)
     assert path.read_bytes() == before
     assert sorted(tmp_path.iterdir()) == there
 
 
-def test_logs_that_could_not_be_kept_are_refused_before_anybody_is_asked(tmp_path):
-    path = robot_file(tmp_path)
+def test_logs_that_could_not_be_kept_are_refused_before_anybody_is_asked(path):
     with pytest.raises(InputError, match=r"exists and is not a directory"):
         run_commission(CommissionOptions(path, log_directory=path))
 
 
-def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_path, monkeypatch, capsys):
-    path = robot_file(tmp_path)
+def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_path, path, monkeypatch, capsys):
     path.write_text(path.read_text(encoding="utf-8") + '[[pose.also]]\nsource = "robot"\n', encoding="utf-8")
     setup = load_setup(path)
     assert (len(setup.config.pose.also), as_sent(setup).config.pose.also) == (1, ())
@@ -285,10 +282,3 @@ def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_
     with pytest.raises(EOFError):
         run_commission(CommissionOptions(path, log_directory=tmp_path / "logs"), goes_away)
     assert "only the first source is examined" in capsys.readouterr().err
-
-
-def test_without_a_yes_nothing_is_written(tmp_path):
-    path = robot_file(tmp_path)
-    before = path.read_text(encoding="utf-8")
-    assert not write_fields(CommissionOptions(path), {("wheels", "sides_swapped"): True}, ask=lambda _prompt: "")
-    assert path.read_text(encoding="utf-8") == before

@@ -28,8 +28,8 @@ from tools.stack import write_robot_file
 SIMULATED = {"reference": {}, "odrive": {"nodes": [3, 5]}, "vesc": {"nodes": [23, 51]}, "agilex": {}}
 
 
-def quiet(_text):
-    pass
+def init(tmp_path, prompt_user=None, name="robot.toml", **options):
+    return run_init(InitOptions(tmp_path / name, **options), prompt_user, lambda _text: None)
 
 
 @pytest.mark.parametrize("driver", SIMULATED)
@@ -47,21 +47,19 @@ def test_foreign_frames_are_nobodys():
 
 @pytest.mark.parametrize("driver", motor_drivers())
 def test_what_is_written_for_any_driver_is_accepted(tmp_path, driver):
-    out = run_init(InitOptions(tmp_path / "robot.toml", driver=driver), None, quiet)
+    out = init(tmp_path, driver=driver)
     assert load_robot_config(out).link.driver == driver
     assert "disco-hw commission" in out.read_text(encoding="utf-8")
 
 
 def test_the_robot_learns_its_geometry_while_it_drives(tmp_path):
-    out = run_init(InitOptions(tmp_path / "robot.toml", driver="reference"), None, quiet)
-    setup = load_setup(out)
+    setup = load_setup(init(tmp_path, driver="reference"))
     assert choose_adaptation(setup.config.control, setup.config.pose, setup.model).kind == "fast"
 
 
 def test_what_a_person_answers_stands_in_the_file(tmp_path):
     answers = iter(["0.1", "", "nonsense", "4096", ""])
-    out = run_init(InitOptions(tmp_path / "robot.toml", driver="reference"), lambda _prompt: next(answers), quiet)
-    robot = load_robot_config(out).robot
+    robot = load_robot_config(init(tmp_path, lambda _prompt: next(answers), driver="reference")).robot
     assert (robot.wheel_radius_m, robot.axial_distance_m, robot.ticks_per_rev) == (0.1, 0.31, 4096)
 
 
@@ -69,9 +67,9 @@ def test_a_file_that_is_there_stays_unless_told_otherwise(tmp_path):
     out = tmp_path / "robot.toml"
     out.write_text("mine")
     with pytest.raises(InputError, match="is there already"):
-        run_init(InitOptions(out, driver="reference"), None, quiet)
+        init(tmp_path, driver="reference")
     assert out.read_text() == "mine"
-    run_init(InitOptions(out, driver="reference", overwrite=True), None, quiet)
+    init(tmp_path, driver="reference", overwrite=True)
     assert "[robot]" in out.read_text(encoding="utf-8")
 
 
@@ -88,7 +86,7 @@ UNFIT = {
 def test_what_cannot_be_written_is_refused_in_one_line_and_nothing_is_left(tmp_path, place, expected_error, overwrite):
     out = place(tmp_path)
     with pytest.raises(InputError, match=expected_error) as refused:
-        run_init(InitOptions(out, driver="reference", overwrite=overwrite), None, quiet)
+        init(out.parent, name=out.name, driver="reference", overwrite=overwrite)
     assert str(refused.value).startswith(f"{out}: ")
     assert "\n" not in str(refused.value)
     assert not list(tmp_path.iterdir())
@@ -96,14 +94,12 @@ def test_what_cannot_be_written_is_refused_in_one_line_and_nothing_is_left(tmp_p
 
 def test_without_a_controller_it_says_what_to_name(tmp_path):
     with pytest.raises(InputError, match=r"--driver with one of .*odrive"):
-        run_init(InitOptions(tmp_path / "robot.toml"), None, quiet)
+        init(tmp_path)
 
 
 def test_what_no_robot_is_like_is_refused_and_nothing_is_left(tmp_path):
     with pytest.raises(InputError, match=r"robot.wheel_radius_m"):
-        run_init(
-            InitOptions(tmp_path / "robot.toml", driver="odrive", measures=(("wheel_radius_m", 9.0),)), None, quiet
-        )
+        init(tmp_path, driver="odrive", measures=(("wheel_radius_m", 9.0),))
     assert not list(tmp_path.iterdir())
 
 
@@ -137,7 +133,7 @@ def line_with(*boards, chatter=b""):
 
 
 def from_line(tmp_path, port, prompt_user=None, **options):
-    return run_init(InitOptions(tmp_path / "robot.toml", f"serial:{port}", listen_s=0.1, **options), prompt_user, quiet)
+    return init(tmp_path, prompt_user, link=f"serial:{port}", listen_s=0.1, **options)
 
 
 ONE, TWO = ["128/1", "128/2"], [["128/1", "128/2"], ["129/1", "129/2"]]
@@ -173,10 +169,8 @@ def test_a_silent_line_is_asked_only_with_somebodys_leave(tmp_path):
 
 def test_who_names_the_controller_has_given_leave(tmp_path):
     with line_with(Roboclaw(0x83)) as (port, _received):
-        assert load_robot_config(from_line(tmp_path, port, driver="roboclaw")).link.settings().motors == (
-            "131/1",
-            "131/2",
-        )
+        link = load_robot_config(from_line(tmp_path, port, driver="roboclaw")).link
+    assert link.settings().motors == ("131/1", "131/2")
 
 
 def test_a_line_on_which_something_speaks_is_not_asked(tmp_path):

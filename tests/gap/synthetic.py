@@ -12,6 +12,7 @@ from disco_hw.gap.noise.body_noise import BodyNoise
 from disco_hw.gap.noise.channels import BodyChannel, WheelChannel
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.search.channel_result import ChannelResult
+from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.selection import Selector, Thresholds, body_moves, wheel_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
@@ -28,17 +29,14 @@ def line_of(speed_rad_s):
     count = speed.shape[0]
     t_s = GRID_STEP_S * np.arange(count)
     angle = np.concatenate([np.zeros((1, 2)), GRID_STEP_S * np.cumsum(speed[:-1], axis=0)])
-    nodes = np.arange(0, count - 1, 2)
-    encoder = GridSamples(
-        nodes, np.zeros(nodes.size), t_s[nodes], np.floor(t_s[nodes] / DEFAULT_SETTINGS.grid.block_s).astype(np.int64)
-    )
-    poses = np.arange(4, count - 2, 4)
-    pose = GridSamples(
-        poses, np.zeros(poses.size), t_s[poses], np.floor(t_s[poses] / DEFAULT_SETTINGS.grid.block_s).astype(np.int64)
+    block = np.floor(t_s / DEFAULT_SETTINGS.grid.block_s).astype(np.int64)
+    encoder, pose = (
+        GridSamples(nodes, np.zeros(nodes.size), t_s[nodes], block[nodes])
+        for nodes in (np.arange(0, count - 1, 2), np.arange(4, count - 2, 4))
     )
     return GriddedDrive(
-        t_s, np.arange(count) == 0, speed.copy(), np.zeros(count), angle, speed, encoder, angle[nodes],
-        2 * GRID_STEP_S, 0.0, 0.0, pose, np.zeros((poses.size, 3)),
+        t_s, np.arange(count) == 0, speed.copy(), np.zeros(count), angle, speed, encoder, angle[encoder.node],
+        2 * GRID_STEP_S, 0.0, 0.0, pose, np.zeros((pose.node.size, 3)),
     )  # fmt: skip
 
 
@@ -70,6 +68,16 @@ def wheels_on(line, noise=WheelNoise()):  # noqa: B008  (it is frozen)
 def body_on(line, poses, use=None):
     """The body channel of a drive with these poses (P, 3)."""
     return BodyChannel.build(replace(line, pose_values=poses), NOISE, vector_of(), use)
+
+
+def poses_of(line, vector, perturbation=None, seed=None):
+    """Poses (P, 3) of a robot with this vector and perturbation of its motion; with a seed, seen with noise."""
+    poses = np.empty((line.pose.t_s.size, 3))
+    track = body_on(line, line.pose_values).track(vector, perturbation)
+    read_angles(track, line.pose.node, line.pose.fraction, poses)
+    if seed is None:
+        return poses
+    return poses + np.random.default_rng(seed).standard_normal(poses.shape) * (0.004, 0.004, 0.006)
 
 
 def moved_by(channel, perturbation):
@@ -109,12 +117,19 @@ def is_accepted(smaller, larger, proof, costs=(500.0, 450.0), layout=BODY, limit
 def body_channel(seed=0, **effects):
     """A body channel and its drive; its poses are the model's with these first parameters of motion effects."""
     line = line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0))
-    clean = np.zeros((line.pose.t_s.size, 3))
-    channel = body_on(line, clean)
-    read_angles(channel.track(vector_of(**effects)), line.pose.node, line.pose.fraction, clean)
-    noise = np.random.default_rng(seed).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
-    channel = body_on(line, clean + noise)
+    channel = body_on(line, poses_of(line, vector_of(**effects), seed=seed))
     return channel, channel.drive
+
+
+def errors_of_size(position_m, yaw_rad, squares=None, **more):
+    """Errors of predictions of this size, with their squares in stretches of time."""
+    return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {}, squares, **more)
+
+
+def errors_in_stretches(squares_m2, squares_rad2):
+    """Errors of predictions whose squares in stretches of time are these."""
+    squares = np.column_stack([squares_m2, squares_rad2]).astype(float)
+    return errors_of_size(*np.sqrt(squares.mean(axis=0)), squares)
 
 
 def of_regression(columns, measured):

@@ -5,12 +5,12 @@ import re
 from dataclasses import replace
 from functools import cache
 
-import numpy as np
 import pytest
 
 from disco_hw import gap
 from disco_hw.errors import LogError
 from disco_hw.gap import find_gap, missing_effects
+from disco_hw.gap.data.stamp_clock import picked
 from disco_hw.gap.report.judge import effect_findings
 from disco_hw.gap.report.page import page
 from disco_hw.gap.search.analysis import final_fit
@@ -23,13 +23,8 @@ MODEL = Model(0.061, 0.415, 0.238)
 
 def first_s(log, seconds):
     """The beginning of a log."""
-
-    def cut(samples):
-        begun = samples.t_s < seconds
-        columns = {name: getattr(samples, name) for name in samples.__slots__}
-        return replace(samples, **{name: each[begun] for name, each in columns.items() if isinstance(each, np.ndarray)})
-
-    return replace(log, commands=cut(log.commands), wheels=cut(log.wheels), poses=cut(log.poses))
+    commands, wheels, poses = (picked(part, part.t_s < seconds) for part in (log.commands, log.wheels, log.poses))
+    return replace(log, commands=commands, wheels=wheels, poses=poses)
 
 
 @cache
@@ -83,7 +78,7 @@ def test_a_steady_circle_shows_what_stands_beside_the_lag_of_real_motors():
 
 @pytest.mark.long
 def test_a_motor_with_a_slew_limit_is_not_given_a_gain_that_misleads():
-    report = find_gap(simulated_drive({"acceleration_limit": 10.0}, seed=7002), Model(0.061, 0.415, 0.238))
+    report = find_gap(simulated_drive({"acceleration_limit": 10.0}, seed=7002), MODEL)
     assert report.why_not_amended is None
 
 

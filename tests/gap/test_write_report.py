@@ -35,10 +35,9 @@ def test_the_search_knows_what_the_robot_can_do(monkeypatch, tmp_path):
 
     monkeypatch.setattr(gap, "load_drive", lambda *_: None)
     monkeypatch.setattr(gap, "find_gap", search)
-    robot = SHIPPED_ROBOT
     with pytest.raises(EnoughError):
-        gap.gap([], robot, tmp_path)
-    assert handed.top_rad_s == load_robot_config(robot).robot.max_wheel_speed_rad_s
+        gap.gap([], SHIPPED_ROBOT, tmp_path)
+    assert handed.top_rad_s == load_robot_config(SHIPPED_ROBOT).robot.max_wheel_speed_rad_s
 
 
 def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatch, tmp_path):
@@ -46,8 +45,7 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
         raise EnoughError
 
     monkeypatch.setattr(gap, "load_drive", search)
-    robot = SHIPPED_ROBOT
-    given = tmp_path / "model.toml"
+    robot, given = SHIPPED_ROBOT, tmp_path / "model.toml"
     given.write_bytes((robot.parent / "wombot_model.toml").read_bytes())
     with pytest.raises(InputError, match="exists and is not a directory"):
         gap.gap([], robot, given)
@@ -106,19 +104,12 @@ def test_a_fleet_ends_in_one_table_with_a_row_for_each_log(fleet, tmp_path):
     # What could not be judged makes no column wider.
     assert columns[1] - columns[0] == len("motor_lag 0.123; v_x += 3 v") + 2
     cut = [
-        [line[a:b].strip() for a, b in zip(columns, [*columns[1:], None], strict=True)] for line in (monday, tuesday)
+        ", ".join(line[a:b].strip() for a, b in zip(columns, [*columns[1:], None], strict=True))
+        for line in (monday, tuesday)
     ]
     assert cut == [
-        [
-            "motor_lag 0.123; v_x += 3 v",
-            "slope",
-            "2 s",
-            "20.0 mm 40 mrad",
-            "10.0 mm 20 mrad",
-            "4.0 mm 8 mrad",
-            "amended",
-        ],
-        ["deadband 0.123; v_x += 3 v", "slope", "2 s", "30.0 mm 60 mrad", "30.0 mm 60 mrad", "4.0 mm 8 mrad", "timed"],
+        "motor_lag 0.123; v_x += 3 v, slope, 2 s, 20.0 mm 40 mrad, 10.0 mm 20 mrad, 4.0 mm 8 mrad, amended",
+        "deadband 0.123; v_x += 3 v, slope, 2 s, 30.0 mm 60 mrad, 30.0 mm 60 mrad, 4.0 mm 8 mrad, timed",
     ]
     assert short.endswith(f"not judged: {fleet[2]}: too little to judge")
     assert result.as_text().startswith(head)

@@ -19,12 +19,23 @@ from tools.stack import running_stack
 pytestmark = pytest.mark.hil
 
 
-# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py).
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.long)])
-def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
+# That each signal ends the loop is tested without a robot (tests/daemon/test_signals.py), and quitting while the robot
+# drives by tests/hil/test_recording.py, too.
+@pytest.mark.parametrize(
+    "how",
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGINT, marks=pytest.mark.long),
+        pytest.param("quit", marks=pytest.mark.thorough),
+    ],
+)
+def test_a_signal_or_a_request_to_quit_stops_the_wheels_before_the_process_ends(tmp_path, how):
     with running_stack(tmp_path) as stack:
         stack.drive()
-        os.kill(stack.daemon.process.pid, number)
+        if how == "quit":
+            stack.operator.request("quit")
+        else:
+            os.kill(stack.daemon.process.pid, how)
         code = stack.daemon.process.wait(60.0)
         ended_s = time.monotonic()
         time.sleep(0.3)
@@ -36,18 +47,6 @@ def test_a_signal_stops_the_wheels_before_the_process_ends(tmp_path, number):
     assert before[-1].state in {"STANDBY", "READY"}
     with open_log(tmp_path / "run.mcap") as log:
         assert log.summary().complete
-
-
-# tests/hil/test_recording.py quits while the robot drives, too.
-@pytest.mark.thorough
-def test_quit_stops_the_wheels_too(tmp_path):
-    with running_stack(tmp_path) as stack:
-        stack.drive()
-        stack.operator.request("quit")
-        assert stack.daemon.process.wait(60.0) == 0
-        ended_s = time.monotonic()
-        rows = stack.truth()
-    assert next(row for row in reversed(rows) if row.t_s < ended_s).fastest < STATIONARY_RAD_S
 
 
 # No valid control for the 100 calls after the 60th, which are two seconds, and an exception 60 plans after that.

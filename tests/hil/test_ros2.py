@@ -60,6 +60,23 @@ def stack_with_bridge(directory, monkeypatch):
             yield stack, child.process
 
 
+@contextmanager
+def bench_with_bridge(directory):
+    """A robot that is driven by speeds from ROS 2; yields its operator and the bridge's process."""
+    with ExitStack() as stack:
+        bench = Bench(directory, stack)
+        with_poses_of_ros(bench.robot_file)
+        bench.drive("--ros2")
+        bench.ready()
+        bridge = ["bridge", "ros2", str(bench.robot_file)]
+        with disco_hw_process("bridge", bridge, directory / "bridge.txt") as child:
+            yield bench.operator, child.process
+
+
+def is_driving(status):
+    return status["drive"]["driving"] and not is_stationary(status)
+
+
 def received_positions(output):
     """(x, y) of each odometry that the node heard, m."""
     rows = [line.split() for line in output.read_text(encoding="utf-8").splitlines()]
@@ -115,20 +132,12 @@ def test_real_ros_gives_the_poses_hears_the_odometry_in_another_node_and_stops_i
 @real_ros
 @pytest.mark.long
 def test_real_ros_arms_and_drives_by_its_speeds(tmp_path):
-    with ExitStack() as stack:
-        bench = Bench(tmp_path, stack)
-        with_poses_of_ros(bench.robot_file)
-        bench.drive("--ros2")
-        bench.ready()
-        bridge = ["bridge", "ros2", str(bench.robot_file)]
-        stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
-        process = stack.enter_context(real_node(tmp_path / "node.txt", "speed", 0.15, 0.3))
-        bench.operator.wait_until(
-            "driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 30.0
-        )
+    node_file = tmp_path / "node.txt"
+    with bench_with_bridge(tmp_path) as (operator, _), real_node(node_file, "speed", 0.15, 0.3) as process:
+        operator.wait_until("driving", is_driving, 30.0)
         process.kill()
-        bench.operator.wait_for("READY", 20.0)
-        bench.operator.wait_for_standstill(20.0)
+        operator.wait_for("READY", 20.0)
+        operator.wait_for_standstill(20.0)
 
 
 def drive(stack):
@@ -176,22 +185,13 @@ def test_it_drives_by_the_transforms_of_a_localisation_and_stops_when_that_dies(
 @pytest.mark.parametrize("whom", ["node", "bridge"])
 def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom, how, tmp_path):
     node_file = tmp_path / "node.txt"
-    with ExitStack() as stack:
-        bench = Bench(tmp_path, stack)
-        with_poses_of_ros(bench.robot_file)
-        bench.drive("--ros2")
-        bench.ready()
-        bridge = stack.enter_context(
-            disco_hw_process("bridge", ["bridge", "ros2", str(bench.robot_file)], tmp_path / "bridge.txt")
-        )
-        speaker = stack.enter_context(node("speed", node_file, (0.15, 0.0, 0.3)))
-        operator = bench.operator
+    with bench_with_bridge(tmp_path) as (operator, bridge), node("speed", node_file, (0.15, 0.0, 0.3)) as speaker:
         request_until(speaker, node_file, "arm", '"ok": true')
-        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 20.0)
-        {"node": speaker, "bridge": bridge.process}[whom].send_signal(how)
+        operator.wait_until("driving", is_driving, 20.0)
+        {"node": speaker, "bridge": bridge}[whom].send_signal(how)
         operator.wait_for("READY", 20.0)
         operator.wait_for_standstill(20.0)
-        {"node": speaker, "bridge": bridge.process}[whom].send_signal(signal.SIGCONT)
+        {"node": speaker, "bridge": bridge}[whom].send_signal(signal.SIGCONT)
         time.sleep(1.0)
         assert operator.status()["state"] == "READY"
 
@@ -200,16 +200,9 @@ def test_speeds_drive_once_asked_to_arm_and_their_silence_disarms_for_good(whom,
 @pytest.mark.parametrize("action", ["button", "estop"])
 def test_an_estop_from_ros_is_latched_until_it_is_reset(action, tmp_path):
     node_file = tmp_path / "node.txt"
-    with ExitStack() as stack:
-        bench = Bench(tmp_path, stack)
-        with_poses_of_ros(bench.robot_file)
-        bench.drive("--ros2")
-        bench.ready()
-        bridge = ["bridge", "ros2", str(bench.robot_file)]
-        stack.enter_context(disco_hw_process("bridge", bridge, tmp_path / "bridge.txt"))
-        speaker, operator = stack.enter_context(node("speed", node_file, (0.15, 0.0, 0.3))), bench.operator
+    with bench_with_bridge(tmp_path) as (operator, _), node("speed", node_file, (0.15, 0.0, 0.3)) as speaker:
         request_until(speaker, node_file, "arm", '"ok": true')
-        operator.wait_until("driving", lambda status: status["drive"]["driving"] and not is_stationary(status), 20.0)
+        operator.wait_until("driving", is_driving, 20.0)
         speaker.stdin.write(f"{action}\n".encode())
         operator.wait_until("stopped", lambda status: status["estop"], 10.0)
         operator.wait_for_standstill(10.0)

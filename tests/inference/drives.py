@@ -5,6 +5,8 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 from disco_hw.config import Prior, Robot, RobotConfig
 from disco_hw.log.drive import DriveLog
 from sim.effects import hidden_effects
@@ -12,17 +14,15 @@ from sim.plant_parameters import PlantParameters
 from tools.simulated_drives import create_drive
 from tools.simulated_log import read_back, simulated_log, write_csv
 
+# In the order of the NAMES of inference.
 TRUTH = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.45}
+THETA = np.array([*TRUTH.values()])
 TICKS_PER_REV = 2048
 
 
 def robot_config(**prior):
     robot = Robot(
-        name="test",
-        wheel_radius_m=0.055,
-        axial_distance_m=0.4,
-        ticks_per_rev=TICKS_PER_REV,
-        max_wheel_speed_rad_s=8.0,
+        name="test", wheel_radius_m=0.055, axial_distance_m=0.4, ticks_per_rev=TICKS_PER_REV, max_wheel_speed_rad_s=8.0
     )
     return RobotConfig(robot=robot, prior=Prior(**prior))
 

@@ -53,7 +53,16 @@ lifted = constant_columns(("pose",), "0.1")
 
 
 POSE = ("pose_x_m", "pose_y_m", "pose_yaw_rad")
+WITH_POSES = "t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m,pose_yaw_rad\n"
+# What becomes of the rows of a good log, or the text in their place; the fault.
 CASES = {
+    "an empty file": ("", "empty file"),
+    "two rows without poses": (
+        "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_ticks,enc_right_ticks\n0,1,1,0,0\n1,1,1,5,5\n",
+        "0 poses",
+    ),
+    "two rows of one time": (WITH_POSES + "0,1,1,0,0,0\n0,1,1,nan,0,0\n", "."),
+    "two rows, the later one first": (WITH_POSES + "5,1,1,0,0,0\n0,1,1,0,0,0\n", "backwards"),
     "no rows": (lambda rows: [], r"no rows|empty|no samples|at least"),
     "no motion": (at_rest, r"wheels turn by 0 rad in all; record a drive"),
     "wheels in the air": (lifted, r"wheels are off the ground or the pose sensor is dead"),
@@ -81,7 +90,10 @@ def test_one_line_names_fault_and_remedy_and_nothing_is_written(good, tmp_path, 
     robot, rows = good
     change, message = CASES[case]
     log = tmp_path / "bad.csv"
-    write(log, list(rows[0]), change(rows))
+    if isinstance(change, str):
+        log.write_text(change)
+    else:
+        write(log, list(rows[0]), change(rows))
     with pytest.raises(InputError, match=message) as caught:
         infer_command([log], robot, tmp_path / "model.toml", tmp_path / "report.html", search=finds())
     assert "\n" not in str(caught.value)

@@ -4,11 +4,9 @@ import pytest
 from disco_hw.inference.estimates import STATISTICS, estimates, whitening
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.noise import USUAL
-from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
+from disco_hw.inference.simulate import Simulator, draw_seeds
 from disco_hw.model import Model
-from tests.inference.drives import TRUTH, logged
-
-THETA = np.array([TRUTH[name] for name in NAMES])
+from tests.inference.drives import THETA, logged
 
 
 def test_a_noiseless_log_gives_the_true_parameters():

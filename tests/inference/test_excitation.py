@@ -24,6 +24,11 @@ def straight(rate_hz=25.0, seconds=20.0, wheel_rad_s=2.0, radius_m=0.05, gap=Non
     )
 
 
+def with_poses(**columns):
+    log = straight()
+    return replace(log, poses=replace(log.poses, **columns))
+
+
 def test_the_roll_between_poses_adds_up_to_the_wheels_angle():
     drive = excitation(straight())
     assert drive.source == "encoders"
@@ -49,23 +54,21 @@ def test_poses_lie_at_their_place_on_the_grid():
 
 
 def test_without_encoders_commands_drive_the_simulations():
-    log = straight()
-    blind = replace(log, wheels=Wheels())
-    drive = excitation(blind)
+    drive = excitation(replace(straight(), wheels=Wheels()))
     assert drive.source == "commands"
     assert drive.roll_rad[:, 0].sum() == pytest.approx(2.0 * (drive.t_s[-1] - drive.t_s[0]), rel=1e-6)
 
 
 def test_a_log_without_encoders_beside_one_with_them_is_said_to_count_for_nothing():
     log = straight()
-    nothing = Wheels()
-    drive = excitation(concatenate([log, replace(log, wheels=nothing)]))
+    mixed = concatenate([log, replace(log, wheels=Wheels())])
+    drive = excitation(mixed)
     assert drive.t_s.size == excitation(log).t_s.size
     assert drive.notes == (
         "500 poses come without encoders and count for nothing beside those with them; infer their log alone",
     )
     assert excitation(concatenate([log, log])).notes == ()
-    assert excitation(concatenate([log, replace(log, wheels=nothing)]), "commands").notes == ()
+    assert excitation(mixed, "commands").notes == ()
 
 
 def test_an_unknown_command_breaks_the_run():
@@ -76,32 +79,17 @@ def test_an_unknown_command_breaks_the_run():
     assert drive.run_pose.size == 3
 
 
-def test_missing_poses_are_refused():
-    log = straight()
-    few = replace(log, poses=Poses(*(getattr(log.poses, name)[:10] for name in Poses.__slots__)))
-    with pytest.raises(UnusableDriveError, match=r"made\.csv: 10 poses.*pose sensor"):
-        excitation(few)
-
-
 @pytest.mark.parametrize(
-    ("changes", "expected_error"),
-    [({"wheel_rad_s": 0.0}, "record a drive"), ({"radius_m": 0.0}, "off the ground or the pose sensor is dead")],
+    ("log", "expected_error"),
+    [
+        (straight(wheel_rad_s=0.0), "record a drive"),
+        (straight(radius_m=0.0), "off the ground or the pose sensor is dead"),
+        (straight(seconds=0.4), r"made\.csv: 10 poses.*pose sensor"),
+        (with_poses(x_m=np.where(np.arange(500) == 30, np.nan, straight().poses.x_m)), "not finite"),
+        (with_poses(t_s=straight().poses.t_s + 100.0), "record them together"),
+    ],
+    ids=["a robot at rest", "lifted wheels", "few poses", "a pose that is NaN", "no common stretch"],
 )
-def test_a_robot_at_rest_and_lifted_wheels_are_refused(changes, expected_error):
+def test_what_says_nothing_of_the_robot_is_refused(log, expected_error):
     with pytest.raises(UnusableDriveError, match=expected_error):
-        excitation(straight(**changes))
-
-
-def test_values_that_are_not_finite_are_refused():
-    log = straight()
-    x = log.poses.x_m.copy()
-    x[30] = np.nan
-    with pytest.raises(UnusableDriveError, match="not finite"):
-        excitation(replace(log, poses=replace(log.poses, x_m=x)))
-
-
-def test_logs_without_a_common_stretch_are_refused():
-    log = straight()
-    shifted = replace(log.poses, t_s=log.poses.t_s + 100.0)
-    with pytest.raises(UnusableDriveError, match="record them together"):
-        excitation(replace(log, poses=shifted))
+        excitation(log)

@@ -11,11 +11,10 @@ from disco_hw.inference.infer import InferOptions, infer, prior_region
 from disco_hw.inference.simulate import NAMES
 from disco_hw.log.drive import Wheels
 from disco_hw.log.load import load_drive
-from tests.inference.drives import TRUTH, logged, robot_config
+from tests.inference.drives import THETA, logged, robot_config
 from tests.tables import thinned
 
 REAL_LOGS = os.environ.get("DISCO_HW_DATA")
-THETA = np.array([TRUTH[name] for name in NAMES])
 FEW = InferOptions(simulations=600, seed=3)
 
 

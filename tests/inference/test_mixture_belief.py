@@ -43,14 +43,11 @@ def test_members_that_agree_become_one_component():
     assert found.weights.size == 1
 
 
-def test_above_the_threshold_disco_takes_the_dominant_component():
+def test_disco_takes_the_dominant_component_above_the_threshold_and_the_moments_of_the_whole_below_it():
     found = belief((0.95, [0.1, 0.06, 0.4], 0.005), (0.05, [0.4, 0.2, 0.2], 0.005))
     mean, covariance = handed_to_disco(found)
     assert mean == pytest.approx([0.1, 0.06, 0.4], abs=1e-6)
     assert covariance == pytest.approx(2.5e-5 * np.eye(3), abs=1e-9)
-
-
-def test_below_it_disco_takes_the_moments_of_the_whole():
     found = belief((0.6, [0.1, 0.06, 0.4], 0.005), (0.4, [0.3, 0.06, 0.4], 0.005))
     mean, covariance = handed_to_disco(found)
     assert mean == pytest.approx([0.18, 0.06, 0.4], abs=1e-6)

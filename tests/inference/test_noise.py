@@ -6,39 +6,37 @@ import pytest
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.noise import USUAL, Noise, _two_terms, measured_noise, unexplained_share
-from disco_hw.inference.simulate import NAMES, Simulator
+from disco_hw.inference.simulate import Simulator
 from disco_hw.model import Model
-from tests.inference.drives import TRUTH, logged
+from tests.inference.drives import THETA, logged
 
-THETA = np.array([TRUTH[name] for name in NAMES])
 TRUE = Noise(0.008, 0.004, 0.01, 0.006, 0.03)
 
 
-def simulated(seed):
-    drive = excitation(logged("rich"))
-    poses = Simulator(Model(0.06, 0.4), drive, TRUE).poses(THETA[None], np.array([seed], dtype=np.uint32))[0]
-    return drive, poses
+def simulated(true=TRUE, count=6, name="rich"):
+    """Simulated drives that have this noise."""
+    drive = excitation(logged(name))
+    seeds = np.arange(count, dtype=np.uint32)
+    poses = Simulator(Model(0.06, 0.4), drive, true).poses(np.repeat(THETA[None], count, axis=0), seeds)
+    return [replace(drive, pose=pose) for pose in poses]
 
 
-def with_poses(drive, poses):
-    fields = {name: getattr(drive, name) for name in drive.__slots__}
-    return type(drive)(**(fields | {"pose": poses}))
+def found_in_simulations(*of):
+    """The noise found in each of some simulated drives."""
+    return [measured_noise(drive, THETA) for drive in simulated(*of)]
 
 
 def test_the_noise_of_a_simulated_log_is_found():
-    found = []
-    for seed in range(4):
-        drive, poses = simulated(seed)
-        found.append(measured_noise(with_poses(drive, poses), THETA).scales()[:5])
+    found = [noise.scales()[:5] for noise in found_in_simulations(TRUE, 4)]
     assert np.mean(found, axis=0) == pytest.approx(TRUE.scales()[:5], rel=0.25)
 
 
 def test_jumps_of_the_sensor_do_not_count():
-    drive, poses = simulated(1)
-    clean = measured_noise(with_poses(drive, poses), THETA).scales()[:5]
-    jumpy = poses.copy()
+    drive = simulated()[1]
+    clean = measured_noise(drive, THETA).scales()[:5]
+    jumpy = drive.pose.copy()
     jumpy[::97, 0] += 0.5
-    assert measured_noise(with_poses(drive, jumpy), THETA).scales()[:5] == pytest.approx(clean, rel=0.5)
+    assert measured_noise(replace(drive, pose=jumpy), THETA).scales()[:5] == pytest.approx(clean, rel=0.5)
 
 
 def test_the_plants_noise_is_found_at_its_own_estimate():
@@ -62,14 +60,6 @@ def test_slip_that_keeps_its_direction_for_a_while_is_rated_by_what_it_grows_to(
     assert sensors == pytest.approx([sensor, 4.0 * sensor], rel=1e-3)
     assert rates == pytest.approx([rate, 4.0 * rate], rel=1e-3)
     assert found_s == tau_s
-
-
-def found_in_simulations(true, count=6):
-    """The noise found in simulated rich drives that have this one."""
-    drive = excitation(logged("rich"))
-    seeds = np.arange(count, dtype=np.uint32)
-    poses = Simulator(Model(0.06, 0.4), drive, true).poses(np.repeat(THETA[None], count, axis=0), seeds)
-    return [measured_noise(with_poses(drive, one), THETA) for one in poses]
 
 
 @pytest.mark.parametrize(("true_s", "low_s", "high_s"), [(0.0, 0.0, 0.06), (0.15, 0.08, 0.25), (0.5, 0.3, 0.8)])
@@ -106,13 +96,7 @@ def test_whether_slip_grows_with_speed_is_found(true_share):
 
 
 def test_one_minute_of_a_circle_tells_the_slip_without_bias():
-    drive = excitation(logged("circle"))
-    simulator = Simulator(Model(0.06, 0.4), drive, TRUE)
-    seeds = np.arange(24, dtype=np.uint32)
-    found = [
-        measured_noise(with_poses(drive, poses), THETA).scales()[:5]
-        for poses in simulator.poses(np.repeat(THETA[None], seeds.size, axis=0), seeds)
-    ]
+    found = [noise.scales()[:5] for noise in found_in_simulations(TRUE, 24, "circle")]
     ratio = np.array(found) / TRUE.scales()[:5]
     assert np.median(ratio, axis=0) == pytest.approx(1.0, abs=0.15)
     assert np.quantile(ratio, 0.1, axis=0).min() > 0.6
@@ -125,4 +109,4 @@ def test_the_poses_of_another_drive_are_not_taken_for_slip():
     swapped = original.pose.copy()
     swapped[:poses] = other.pose[:poses]
     assert unexplained_share(original, THETA) < 0.15
-    assert unexplained_share(with_poses(original, swapped), THETA) > 0.8
+    assert unexplained_share(replace(original, pose=swapped), THETA) > 0.8

@@ -9,11 +9,10 @@ from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.infer import noise_spread
 from disco_hw.inference.noise import Noise, measured_noise
-from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
+from disco_hw.inference.simulate import Simulator, draw_seeds
 from disco_hw.model import Model
-from tests.inference.drives import TRUTH, logged
+from tests.inference.drives import THETA, logged
 
-THETA = np.array([TRUTH[name] for name in NAMES])
 TRUE = Noise(0.006, 0.006, 0.008, 0.005, 0.02)
 MODEL = Model(0.06, 0.4)
 

@@ -6,22 +6,31 @@ from disco_hw.inference.noise import Noise
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds, physical_range
 from disco_hw.model import EffectSetting, Model
 from disco_hw.model.step import FreeRun
-from tests.inference.drives import TRUTH, logged
+from tests.inference.drives import THETA, TRUTH, logged
 
 SILENT = Noise(0.0, 0.0, 0.0, 0.0, 0.0)
-THETA = np.array([[TRUTH[name] for name in NAMES]])
 
 
-def simulator(noise=SILENT, drive="poor", noiseless=False):
-    return Simulator(Model(0.06, 0.4), excitation(logged(drive, noiseless=noiseless)), noise)
+def simulator(noise=SILENT, noiseless=False):
+    return Simulator(Model(0.06, 0.4), excitation(logged("poor", noiseless=noiseless)), noise)
 
 
-def test_without_noise_the_true_parameters_repeat_a_noiseless_log():
+def undisturbed(sim, theta=THETA, count=1):
+    """Poses of simulations with one seed for all."""
+    return sim.poses(np.tile(theta, (count, 1)), np.zeros(count, dtype=np.uint32))
+
+
+def repeated(sim, count):
+    """Poses of simulations of the true parameters that differ in their noise."""
+    return sim.poses(np.tile(THETA, (count, 1)), draw_seeds(count, np.random.default_rng(1)))
+
+
+def test_without_noise_the_true_parameters_and_no_others_repeat_a_noiseless_log():
     sim = simulator(noiseless=True)
-    poses = sim.poses(THETA, np.zeros(1, dtype=np.uint32))[0]
-    error = poses - sim.drive.pose
-    assert np.abs(error[:, :2]).max() < 3e-3
-    assert np.abs(error[:, 2]).max() < 5e-3
+    error = np.abs(undisturbed(sim)[0] - sim.drive.pose)
+    assert error[:, :2].max() < 3e-3
+    assert error[:, 2].max() < 5e-3
+    assert np.abs(undisturbed(sim, THETA * [1.0, 1.1, 1.0])[0] - sim.drive.pose)[:, :2].max() > 0.02
 
 
 @pytest.mark.thorough
@@ -30,10 +39,9 @@ def test_each_simulation_remembers_its_own_drive_from_the_beginning():
     plain = simulator()
     drive = plain.drive
     found = Simulator(Model(0.06, 0.4, effects=(rubber,)), drive, SILENT)
-    first, second = found.poses(np.repeat(THETA, 2, axis=0), np.zeros(2, dtype=np.uint32))
+    first, second = undisturbed(found, count=2)
     np.testing.assert_array_equal(first, second)
-    without = plain.poses(THETA, np.zeros(1, dtype=np.uint32))[0]
-    assert np.abs(first - without)[:, 2].max() > 0.02
+    assert np.abs(first - undisturbed(plain)[0])[:, 2].max() > 0.02
     # As a run of the model from its first pose, whose wheels do as they are told.
     start = np.array([*drive.pose[0], *drive.wheel_rad_s[0]])
     model = Model(*(TRUTH[name] for name in ("wheel_radius_m", "axial_distance_m", "x_icr_m")), effects=(rubber,))
@@ -45,30 +53,19 @@ def test_each_simulation_remembers_its_own_drive_from_the_beginning():
     np.testing.assert_allclose(first[of_first_run, 2], expected, atol=1e-6)
 
 
-def test_wrong_parameters_do_not():
-    sim = simulator(noiseless=True)
-    poses = sim.poses(THETA * [1.0, 1.1, 1.0], np.zeros(1, dtype=np.uint32))[0]
-    assert np.abs(poses - sim.drive.pose)[:, :2].max() > 0.02
-
-
 def test_the_same_seeds_give_the_same_poses_however_they_are_shared_out():
     sim = simulator(Noise(0.005, 0.01, 0.004, 0.004, 0.014))
     seeds = draw_seeds(70, np.random.default_rng(0))
-    theta = np.repeat(THETA, 70, axis=0)
-
-    def last(poses):
-        return poses[:, -1]
-
-    together = sim.summaries(theta, seeds, last)
+    theta = np.tile(THETA, (70, 1))
+    together = sim.summaries(theta, seeds, lambda poses: poses[:, -1])
     alone = np.concatenate([sim.poses(theta[i : i + 1], seeds[i : i + 1])[:, -1] for i in range(70)])
     assert np.array_equal(together, alone)
     assert np.unique(together[:, 0]).size == 70
 
 
 def test_noise_has_the_size_it_says():
-    noise = Noise(0.02, 0.03, 0.004, 0.006, 0.014)
-    sim = simulator(noise)
-    poses = sim.poses(np.repeat(THETA, 400, axis=0), draw_seeds(400, np.random.default_rng(1)))
+    sim = simulator(Noise(0.02, 0.03, 0.004, 0.006, 0.014))
+    poses = repeated(sim, 400)
     assert poses[:, 0, :2].std(axis=0) == pytest.approx([0.02, 0.02], rel=0.15)
     assert poses[:, 0, 2].std() == pytest.approx(0.03, rel=0.15)
     yaw_sd = np.sqrt(0.03**2 + 0.014**2 * sim.drive.moving_s.sum())
@@ -76,9 +73,8 @@ def test_noise_has_the_size_it_says():
 
 
 def test_slip_that_lasts_and_grows_with_speed_adds_up_to_as_much():
-    noise = Noise(0.0, 0.0, 0.0, 0.0, 0.014, correlation_s=0.2, speed_share=1.0)
-    sim = simulator(noise)
-    poses = sim.poses(np.repeat(THETA, 400, axis=0), draw_seeds(400, np.random.default_rng(1)))
+    sim = simulator(Noise(0.0, 0.0, 0.0, 0.0, 0.014, correlation_s=0.2, speed_share=1.0))
+    poses = repeated(sim, 400)
     yaw_sd = 0.014 * np.sqrt(sim.drive.moving_s.sum())
     assert poses[:, -1, 2].std() == pytest.approx(yaw_sd, rel=0.15)
     steps = np.diff(poses[:, :, 2] - poses[:, :, 2].mean(axis=0), axis=1)
@@ -88,8 +84,7 @@ def test_slip_that_lasts_and_grows_with_speed_adds_up_to_as_much():
 
 
 def test_slip_in_yaw_turns_the_body_about_the_end_of_its_lever():
-    sim = simulator(Noise(0.0, 0.0, 0.0, 0.0, 0.014, lever_m=TRUTH["x_icr_m"]))
-    poses = sim.poses(np.repeat(THETA, 50, axis=0), draw_seeds(50, np.random.default_rng(1)))
+    poses = repeated(simulator(Noise(0.0, 0.0, 0.0, 0.0, 0.014, lever_m=TRUTH["x_icr_m"])), 50)
     ahead = TRUTH["x_icr_m"] * np.stack([np.cos(poses[..., 2]), np.sin(poses[..., 2])], axis=-1)
     # The centre of rotation goes where it heads: never sideways.
     steps = np.diff(poses[..., :2] + ahead, axis=1)
@@ -102,9 +97,8 @@ def test_slip_in_yaw_turns_the_body_about_the_end_of_its_lever():
 
 def test_progress_is_told_of_every_simulation():
     done = []
-    sim = simulator()
     seeds = draw_seeds(50, np.random.default_rng(1))
-    sim.summaries(np.repeat(THETA, 50, axis=0), seeds, lambda p: p[:, 0], done=done.append)
+    simulator().summaries(np.tile(THETA, (50, 1)), seeds, lambda poses: poses[:, 0], done=done.append)
     assert sum(done) == 50
 
 

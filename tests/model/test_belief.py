@@ -56,15 +56,12 @@ def test_gaussian_refuses(mean, covariance, fault):
         gaussian(mean, covariance)
 
 
-def test_mixture_refuses():
+def test_mixture_and_uniform_refuse():
     with pytest.raises(ValueError, match="at least one component"):
         Mixture(np.array([]), ())
     with pytest.raises(ValueError, match="weights must all be positive"):
         Mixture(np.array([1.0, 0.0]), (gaussian(), gaussian()))
     with pytest.raises(ValueError, match="name different parameters"):
         Mixture(np.array([1.0, 1.0]), (gaussian(), Gaussian(("a", "c"), np.zeros(2), COVARIANCE)))
-
-
-def test_uniform_refuses_an_empty_range():
     with pytest.raises(ValueError, match="low must be below high"):
         Uniform(("a",), np.array([1.0]), np.array([1.0]))

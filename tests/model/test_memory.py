@@ -25,6 +25,9 @@ def test_a_mean_has_followed_a_step_by_63_percent_after_its_time():
     assert from_mean[-1] == pytest.approx(0.0, abs=1e-6)
     slower = BODY_MEMORIES["v_x"]["(v - mean_3s(v))"].at_nodes(STEP_S, speed, rate)
     assert slower[299] == pytest.approx(3.0 * math.exp(-2.995 / 3.0), rel=1e-5)
+    # Each by its own speed.
+    assert BODY_MEMORIES["v_x"]["(v - mean_1s(v))"].at_nodes(STEP_S, speed, rate)[99] == pytest.approx(3.0 * LEFT)
+    assert BODY_MEMORIES["v_y"] == {}
 
 
 def test_what_both_wheels_take_lowers_each_in_proportion():
@@ -51,15 +54,6 @@ def test_a_change_of_the_command_is_overshot_and_comes_to_rest():
     changed = of_command("(u - mean_1s(u))", up)
     assert changed[999] == pytest.approx([0.0, 0.0], abs=1e-3)
     assert changed[1099] == pytest.approx([2.0 * LEFT, 1.0 * LEFT], rel=1e-3)
-
-
-def test_the_body_is_asked_in_its_own_speeds():
-    v, w = np.full(500, 0.4), np.full(500, -0.9)
-    turning = BODY_MEMORIES["omega"]["(omega - mean_1s(omega))"].at_nodes(STEP_S, v, w)
-    assert turning[99] == pytest.approx(-0.9 * LEFT)
-    forward = BODY_MEMORIES["v_x"]["(v - mean_1s(v))"].at_nodes(STEP_S, v, w)
-    assert forward[99] == pytest.approx(0.4 * LEFT)
-    assert BODY_MEMORIES["v_y"] == {}
 
 
 def test_a_robot_whose_tyres_slip_follows_its_wheels_by_so_much_a_second():

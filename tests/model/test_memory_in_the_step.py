@@ -7,6 +7,7 @@ from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, sa
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import FreeRun, simulate
 from disco_hw.model.terms import BODY_MEMORIES, BODY_TARGETS, COMMAND_MEMORIES, TERMS, memories_of
+from tests.model.reference import reference_run
 
 BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05
@@ -28,29 +29,20 @@ def a_few(direction=0.3, load=-0.01, rubber=-0.5, lag_s=0.0):
     return model_of(*others, *(EffectSetting(name, {"k": k}) for name, k in terms.items()))
 
 
-def run(model, commands, step_s=STEP_S, means=None, start=None, history=0):
-    free = FreeRun(model, model.point()[None], step_s)
-    return free.states(np.zeros(5) if start is None else start, commands, history, means=means)
-
-
-def by_reference(model, commands, step_s=STEP_S):
-    theta = plain.theta_of(model.parameter_names, model.point())
-    states = [plain.RobotState(0.0, 0.0, 0.0, 0.0, 0.0)]
-    for t, (left, right) in enumerate(commands):
-        states.append(plain.step(theta, states[-1], left, right, step_s, t * step_s)[0])
-    return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])
+def run(model, commands, step_s=STEP_S, means=None, start=(0.0,) * 5):
+    return FreeRun(model, model.point()[None], step_s).states(np.array(start), commands, 0, means=means)
 
 
 @pytest.mark.long
 def test_every_term_that_remembers_agrees_with_the_reference():
     effects = [EffectSetting(name, {"k": 0.003 * (1 + n)}) for n, name in enumerate(EVERY)]
     model = model_of(EffectSetting("motor_lag", {"tau_s": 0.1}), EffectSetting("v_x += k v^3", {"k": -0.2}), *effects)
-    np.testing.assert_allclose(run(model, DRIVE), by_reference(model, DRIVE), atol=1e-9)
+    np.testing.assert_allclose(run(model, DRIVE), reference_run(model, DRIVE, STEP_S), atol=1e-9)
 
 
 def test_terms_that_remember_agree_with_the_reference_among_others():
     model = a_few(lag_s=0.1)
-    np.testing.assert_allclose(run(model, DRIVE), by_reference(model, DRIVE), atol=1e-9)
+    np.testing.assert_allclose(run(model, DRIVE), reference_run(model, DRIVE, STEP_S), atol=1e-9)
     assert np.abs(run(model, DRIVE) - run(a_few(0.0, 0.0, 0.0, 0.1), DRIVE)).max() > 0.1
 
 
@@ -73,7 +65,7 @@ def test_a_body_turns_by_the_feature_of_how_its_wheels_turned():
 def test_a_robot_whose_tyres_slip_goes_by_what_they_grip():
     """Wheels of 60 mm that spin up to 0.24 m/s at once, and 2 m/s^2: in steps of 0.1 m/s."""
     model = model_of(EffectSetting(SLIPPING, {"k": -1.0}))
-    np.testing.assert_allclose(run(model, DRIVE), by_reference(model, DRIVE), atol=1e-12)
+    np.testing.assert_allclose(run(model, DRIVE), reference_run(model, DRIVE, STEP_S), atol=1e-12)
     means = np.zeros(1)
     ahead = run(model, np.full((4, 2), 4.0), means=means)[:, 0]
     assert np.diff(ahead) == pytest.approx([0.05 * 0.05, 0.05 * 0.15, 0.05 * (0.24 - 0.04 * 0.4 / 2.0), 0.05 * 0.24])

@@ -7,6 +7,7 @@ import pytest
 
 from disco_hw.model import Model, plain
 from disco_hw.model.step import FreeRun
+from tests.model.reference import reference_run
 
 
 def run(model, start, commands, step_s=0.1):
@@ -61,13 +62,10 @@ def test_an_euler_step_is_the_published_one():
 
 def test_fast_turns_of_several_radians_a_step_stay_exact():
     model = Model(0.5, 0.1, 0.0)
-    states = run(model, (0.0, 0.0, 0.0, 0.0, 0.0), [(-4.0, 4.0), (-8.0, 7.0)] * 5)
-    theta = plain.theta_of(model.parameter_names, model.point())
-    state = plain.RobotState(0.0, 0.0, 0.0, 0.0, 0.0)
-    for left, right in [(-4.0, 4.0), (-8.0, 7.0)] * 5:
-        state, _, _ = plain.step(theta, state, left, right, 0.1)
-    assert abs(state.yaw) > 30.0
-    np.testing.assert_allclose(states[-1, :3], [state.x, state.y, state.yaw], atol=1e-6)
+    commands = [(-4.0, 4.0), (-8.0, 7.0)] * 5
+    end = reference_run(model, commands, 0.1)[-1, :3]
+    assert abs(end[2]) > 30.0
+    np.testing.assert_allclose(run(model, (0.0,) * 5, commands)[-1, :3], end, atol=1e-6)
 
 
 @pytest.mark.parametrize(("speed_rad_s", "carried"), [(3.0, 1.0), (0.1, 0.4)])

@@ -6,33 +6,22 @@ import pytest
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, save_model
 from disco_hw.model.step import FreeRun
-from disco_hw.model.terms import (
-    BODY_FEATURES,
-    BODY_MEMORIES,
-    BODY_TARGETS,
-    COMMAND_FEATURES,
-    COMMAND_MEMORIES,
-    TERMS,
-)
+from disco_hw.model.terms import BODY_FEATURES, BODY_MEMORIES, BODY_TARGETS, COMMAND_FEATURES, COMMAND_MEMORIES, TERMS
 from tests.model import features
+from tests.model.reference import reference_run
 
 BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05
 DRIVE = np.repeat([[4.0, 4.0], [-3.0, 2.0], [6.0, 1.0], [0.0, 0.5], [-5.0, -4.0]], 6, axis=0)
 
 
-def compiled(effects, time_s=60.0):
+def compiled(effects):
     model = Model(*BASE, effects=effects)
-    return FreeRun(model, model.point()[None], STEP_S).states(np.zeros(5), DRIVE, 0, time_s)
+    return FreeRun(model, model.point()[None], STEP_S).states(np.zeros(5), DRIVE, 0, 60.0)
 
 
-def by_reference(effects, time_s=60.0):
-    model = Model(*BASE, effects=effects)
-    theta = plain.theta_of(model.parameter_names, model.point())
-    states = [plain.RobotState(0.0, 0.0, 0.0, 0.0, 0.0)]
-    for t, (left, right) in enumerate(DRIVE):
-        states.append(plain.step(theta, states[-1], left, right, STEP_S, time_s + t * STEP_S)[0])
-    return np.array([[s.x, s.y, s.yaw, s.wheel_left, s.wheel_right] for s in states])
+def by_reference(effects):
+    return reference_run(Model(*BASE, effects=effects), DRIVE, STEP_S, time_s=60.0)
 
 
 def every_term(target, features):

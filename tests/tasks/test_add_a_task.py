@@ -19,7 +19,7 @@ from disco_hw.runtime.robot_setup import changed_task, load_setup, record_of, re
 from disco_hw.tasks import RobotTask, kinds
 from disco_hw.viewer import curves
 from disco_hw.viewer.timeline import Timeline
-from tests.runtime.path_robot import ROBOTS
+from tests.runtime.path_robot import task_robot
 
 DOCUMENT = Path(__file__).parents[2] / "docs/add-a-task.md"
 EXAMPLE = DOCUMENT.parent / "examples/square.py"
@@ -28,18 +28,11 @@ EXAMPLE = DOCUMENT.parent / "examples/square.py"
 @pytest.fixture
 def square(tmp_path):
     """The robot with the task of the page, whose file lies beside those of the package."""
-    example = EXAMPLE.read_text("utf-8")
     folder = tmp_path / "kinds"
     folder.mkdir()
-    (folder / "square.py").write_text(example)
+    shutil.copy(EXAMPLE, folder)
     disco_hw.tasks.__path__.append(str(folder))
-    text = (ROBOTS / "wombot.toml").read_text()
-    circle = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
-    assert circle in text
-    robot = tmp_path / "robot.toml"
-    robot.write_text(text.replace(circle, 'kind = "square"\nside_m = 1.2\n'))
-    shutil.copy(ROBOTS / "wombot_model.toml", tmp_path)
-    yield robot
+    yield task_robot(tmp_path, 'kind = "square"\nside_m = 1.2\n')
     disco_hw.tasks.__path__.remove(str(folder))
     del sys.modules["disco_hw.tasks.square"], disco_hw.tasks.square
 

@@ -12,7 +12,8 @@ from disco_hw.jit import kernel_function
 from disco_hw.tasks.circle import CircleCost, CircleTask
 from disco_hw.tasks.path import PathTask
 
-NOTHING = (np.float32(0.0),) * 5
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+NOTHING = (ZERO,) * 5
 
 
 class Nonsense(NamedTuple):
@@ -23,14 +24,12 @@ class Nonsense(NamedTuple):
 
 @kernel_function
 def staged(task):
-    zero, one = np.float32(0.0), np.float32(1.0)
-    return stage_cost(task, zero, 0, zero, zero, one, zero, one, zero, zero, (zero, zero, zero, zero, zero))
+    return stage_cost(task, ZERO, 0, ZERO, ZERO, ONE, ZERO, ONE, ZERO, ZERO, NOTHING)
 
 
 @kernel_function
 def ended(task):
-    zero, one = np.float32(0.0), np.float32(1.0)
-    return terminal_cost(task, zero, one, zero, one, zero, (zero, zero, zero, zero, zero))
+    return terminal_cost(task, ZERO, ONE, ZERO, ONE, ZERO, NOTHING)
 
 
 @kernel_function
@@ -40,13 +39,12 @@ def looks(task):
 
 @kernel_function
 def followed(task):
-    zero, one = np.float32(0.0), np.float32(1.0)
-    return follow(task, zero, one, zero, zero, (zero, zero, zero, one, zero))
+    return follow(task, ZERO, ONE, ZERO, ZERO, (ZERO, ZERO, ZERO, ONE, ZERO))
 
 
 @kernel_function
 def looked_up(task):
-    return row_of(task, np.float32(0.0))
+    return row_of(task, ZERO)
 
 
 @pytest.mark.parametrize(
@@ -90,20 +88,18 @@ def test_a_circle_has_costs():
 )
 def test_a_cost_gives_as_it_stands_what_it_gives_compiled(task):
     terms = task.planned("default").prepare(0.0, 0.9, 0.2, 0.3, None, 0.1, 50).terms
-    zero, one = np.float32(0.0), np.float32(1.0)
     if hasattr(terms, "table"):
-        at = 4 * int(terms.row_of(zero))
-        found = (zero, *terms.table[at : at + 4])
+        at = 4 * int(terms.row_of(ZERO))
+        found = (ZERO, *terms.table[at : at + 4])
         assert looks(terms)
-        row = (zero, zero, zero, one, zero)
-        np.testing.assert_allclose(followed(terms), terms.follow(zero, one, zero, zero, row), rtol=1e-6)
-        assert looked_up(terms) == terms.row_of(zero)
+        row = (ZERO, ZERO, ZERO, ONE, ZERO)
+        np.testing.assert_allclose(followed(terms), terms.follow(ZERO, ONE, ZERO, ZERO, row), rtol=1e-6)
+        assert looked_up(terms) == terms.row_of(ZERO)
     else:
         found = NOTHING
-        np.testing.assert_allclose(
-            staged(terms), terms.stage(zero, 0, zero, zero, one, zero, one, zero, zero, NOTHING), rtol=1e-6
-        )
-    assert terms.terminal(zero, one, zero, one, zero, found) > 0.0
+        uncompiled = terms.stage(ZERO, 0, ZERO, ZERO, ONE, ZERO, ONE, ZERO, ZERO, NOTHING)
+        np.testing.assert_allclose(staged(terms), uncompiled, rtol=1e-6)
+    assert terms.terminal(ZERO, ONE, ZERO, ONE, ZERO, found) > 0.0
 
 
 def test_what_costs_are_written_in_is_a_length():

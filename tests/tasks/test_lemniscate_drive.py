@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 
@@ -17,24 +15,14 @@ from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.viewer import curves
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose
-from tests.runtime.path_robot import ROBOTS
+from tests.runtime.path_robot import task_robot
 from tests.runtime.simulated import replayed, simulated_stack, write_run
 
 FIGURE = 'kind = "lemniscate"\nsize_m = 0.9\nspeed_m_s = 0.25\n'
 
 
-def lemniscate_robot(directory):
-    circle = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
-    text = (ROBOTS / "wombot.toml").read_text()
-    assert circle in text
-    robot = directory / "robot.toml"
-    robot.write_text(text.replace(circle, FIGURE))
-    shutil.copy(ROBOTS / "wombot_model.toml", directory)
-    return robot
-
-
 def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_path):
-    robot_file = lemniscate_robot(tmp_path)
+    robot_file = task_robot(tmp_path, FIGURE)
     setup = load_setup(robot_file)
     stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
     stack.run(1.5)

@@ -53,11 +53,25 @@ def test_a_new_run_counts_anew():
     assert progress.laps == 0.0
 
 
-def test_a_circle_counts_turns():
-    progress = CircleTask().progress()
-    for angle in np.linspace(0.0, math.pi, 50):
-        progress.add(0, math.cos(angle), math.sin(angle), math.nan)
-    assert (progress.laps, progress.finished) == (pytest.approx(0.5), False)
+def drive_round(progress, laps, steps=200):
+    for angle in np.linspace(3.0, 3.0 + math.tau * laps, steps + 1):
+        progress.add(0, 1.0 + math.cos(angle), -2.0 + math.sin(angle), math.nan)
+
+
+@pytest.mark.parametrize("laps", [0.5, 2.25, -1.75])
+def test_a_circle_counts_turns_in_both_directions(laps):
+    progress = CircleTask(center_x_m=1.0, center_y_m=-2.0).progress()
+    drive_round(progress, laps)
+    assert (progress.laps, progress.finished) == (pytest.approx(laps), False)
+
+
+def test_a_new_run_round_a_circle_starts_a_new_count_and_a_pause_keeps_the_old_one():
+    progress = CircleTask(center_x_m=1.0, center_y_m=-2.0).progress()
+    drive_round(progress, 1.0)
+    progress.pause()
+    assert progress.laps == pytest.approx(1.0)
+    drive_round(progress, 0.5)
+    assert progress.laps == pytest.approx(0.5)
 
 
 def test_way_points_by_time_end_when_the_time_is_over_and_the_robot_is_there():

@@ -16,27 +16,29 @@ ANGLE = np.linspace(0.0, 2.0 * np.pi, 100)
 ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]), 5.0 + 4.0 * ANGLE)
 
 
+FROM_START = Waypoints(ROUND.places_m, 4.0 * ANGLE)
+
+
+def followed(task, plant, planner, steps, begin=0):
+    """Drive for these steps; distance (m) to where the robot should be after each, by a time that begins with one."""
+    return [
+        instant_cost(task, plant.x_m, plant.y_m, plant.forward_m_s, (step + 1 - begin) * 0.1)
+        for step in drive(planner, plant, steps)
+    ]
+
+
 def test_places_are_reached_at_their_times_after_waiting_for_the_first():
     task = TimedPathCost(ROUND)
-    plant = plant_at(0.0, 0.0, 0.3)
-    off = [
-        instant_cost(task, plant.x_m, plant.y_m, plant.forward_m_s, (step - 9_999) * 0.1)
-        for step in drive(planner_for(task), plant, range(10_000, 10_350))
-    ]
+    off = followed(task, plant_at(0.0, 0.0, 0.3), planner_for(task), range(10_000, 10_350), 10_000)
     assert np.mean(off[60:]) < 0.05
     assert np.max(off[100:]) < 0.12
 
 
 def test_a_refined_plan_is_nearer_to_the_place_than_a_sampled_one_and_stops_at_the_last():
-    off = {}
+    task, off = TimedPathCost(FROM_START), {}
     for refine in (False, True):
-        task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
-        plant = plant_at(0.0, 0.0, 0.0)
         planner = planner_for(task, DiscoSettings.for_speed(0.25, 10.0, refine))
-        off[refine] = [
-            instant_cost(task, plant.x_m, plant.y_m, plant.forward_m_s, (step + 1) * 0.1)
-            for step in drive(planner, plant, range(300))
-        ]
+        off[refine] = followed(task, plant_at(0.0, 0.0, 0.0), planner, range(300))
     # The circle takes 25 s; the first seconds are those of a robot that comes from rest.
     assert np.mean(off[True][60:250]) < 0.005
     assert np.mean(off[True][60:250]) < 0.2 * np.mean(off[False][60:250])
@@ -66,20 +68,15 @@ def test_the_heading_is_that_of_a_robot_that_stays_with_the_place():
 
 @pytest.mark.parametrize("trap", ["standing", "spinning"])
 def test_the_planner_leaves_the_traps(trap):
-    task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
+    task = TimedPathCost(FROM_START)
     plant, disco = plant_at(0.0, 0.0, 0.0), planner_for(task)
     begin_with(disco, plant, (-SPIN, SPIN) if trap == "spinning" else (0.0, 0.0))
-    off = [
-        instant_cost(task, plant.x_m, plant.y_m, plant.forward_m_s, (step + 1) * 0.1)
-        for step in drive(disco, plant, range(1, 151))
-    ]
-    assert np.mean(off[-50:]) < 0.08
+    assert np.mean(followed(task, plant, disco, range(1, 151))[-50:]) < 0.08
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, math.pi])
 def test_it_is_followed_forwards(yaw_rad):
-    task = TimedPathCost(Waypoints(ROUND.places_m, 4.0 * ANGLE))
-    plant = plant_at(0.0, 0.0, yaw_rad)
+    task, plant = TimedPathCost(FROM_START), plant_at(0.0, 0.0, yaw_rad)
     speeds, off = [], []
     for step in drive(planner_for(task), plant, range(200)):
         speeds.append(plant.forward_m_s)

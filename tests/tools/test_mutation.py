@@ -1,4 +1,7 @@
+import tomllib
+
 from tools.check.mutation import mutants
+from tools.firmware_mutants import EQUIVALENTS, FIRMWARE, HAND_WRITTEN
 
 
 def changes(source):
@@ -36,3 +39,13 @@ def test_each_is_applied_at_its_place_and_named_by_its_line():
     mutant = next(mutant for mutant in mutants(source) if mutant.old == "-")
     assert mutant.apply(source) == "a = 1u;\nb = a  +  1u;\n"
     assert (mutant.line, mutant.key) == (2, "b = a «-» 1u; [- -> +]")
+
+
+# The sweep itself takes more than an hour (`make firmware-mutants`).
+def test_every_listed_equivalent_is_still_a_mutant_and_has_its_reason():
+    listed = tomllib.loads(EQUIVALENTS.read_text("utf-8"))
+    assert set(listed) <= set(HAND_WRITTEN)
+    for name, reasons in listed.items():
+        keys = {mutant.key for mutant in mutants((FIRMWARE / name).read_text("utf-8"))}
+        assert set(reasons) <= keys, "the line has changed: judge the mutant anew"
+        assert all(len(reason.split()) >= 4 for reason in reasons.values())

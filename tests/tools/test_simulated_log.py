@@ -44,15 +44,11 @@ def test_each_row_is_one_event_and_time_never_goes_back():
         assert all(np.array_equal(np.isnan(log[first]), np.isnan(log[other])) for other in others)
 
 
-def test_commands_readings_and_poses_come_at_their_rates():
+def test_commands_readings_and_poses_come_at_their_rates_and_commands_are_the_drives():
     log = columns(simulated_log(CIRCLE, IDEAL, seed=1))
     assert np.count_nonzero(~np.isnan(log["cmd_left_rad_s"])) == len(CIRCLE.t_s)
     assert np.count_nonzero(~np.isnan(log["enc_left_ticks"])) == 63 * 50
     assert np.count_nonzero(~np.isnan(log["pose_x_m"])) == 63 * 25
-
-
-def test_the_commands_are_the_drives():
-    log = columns(simulated_log(CIRCLE, IDEAL, seed=1))
     given = log["cmd_right_rad_s"][~np.isnan(log["cmd_right_rad_s"])]
     np.testing.assert_allclose(given, CIRCLE.right_rad_s, atol=1e-5)
 

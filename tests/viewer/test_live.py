@@ -1,5 +1,5 @@
+import itertools
 import json
-import time
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -19,19 +19,20 @@ from disco_hw.viewer.panel import live_summary
 from disco_hw.viewer.recording import stage_of_robot
 from disco_hw.viewer.scene import DARK
 from disco_hw.viewer.server import serving
+from tests.drivers.waiting import wait_until
 from tests.runtime.path_robot import path_robot
 from tools.viewer_run import PERIOD_NS, ROBOT_FILE, START_NS, pose_at, tick_records
 
 
 @pytest.fixture
-def page(tmp_path):
+def live(tmp_path):
     socket = tmp_path / "control.sock"
-    with serving("test", port=0) as served:
-        desk = Desk(socket, ROBOT_FILE)
-        made = LivePage(served.server, stage_of_robot(ROBOT_FILE), socket, desk)
-        yield made, socket
-        made.close()
-        desk.close()
+    with (
+        serving("test", port=0) as served,
+        closing(Desk(socket, ROBOT_FILE)) as desk,
+        closing(LivePage(served.server, stage_of_robot(ROBOT_FILE), socket, desk)) as page,
+    ):
+        yield page
 
 
 def ticks(first, last):
@@ -39,8 +40,7 @@ def ticks(first, last):
     return [(now_ns, record) for now_ns, got in made for record in got]
 
 
-def test_the_newest_instant_is_drawn(page):
-    live, _ = page
+def test_the_newest_instant_is_drawn(live):
     live.ingest(ticks(0, 51))
     live.draw(everything=True)
     assert tuple(live.scene._robot.position[:2]) == pytest.approx(pose_at(50)[:2])
@@ -51,15 +51,13 @@ def test_the_newest_instant_is_drawn(page):
     assert "armed on request" in live._column.events.content
 
 
-def test_before_anything_is_known_it_says_so(page):
-    live, _ = page
+def test_before_anything_is_known_it_says_so(live):
     live.draw(everything=True)
     assert "| page is behind | — ms" in live._column.details.content
     assert not live.scene._robot.visible
 
 
-def test_a_drive_by_hand_shows_what_is_excited_and_what_is_missing(page):
-    live, _ = page
+def test_a_drive_by_hand_shows_what_is_excited_and_what_is_missing(live):
     live.draw(everything=True)
     assert not live._column.motions.visible
     coverage = Coverage(6.4)
@@ -73,20 +71,19 @@ def test_a_drive_by_hand_shows_what_is_excited_and_what_is_missing(page):
     assert "✔ straight slow | 3 of 3 s" in live._column.coverage.content
 
 
-def test_records_come_over_the_feed(page):
-    live, socket = page
-    feed = ViewerFeed(feed_path(socket))
-    deadline, tick = time.monotonic() + 60.0, 0
-    while live.timeline.last_ns is None:
-        assert time.monotonic() < deadline
-        feed.put(*tick_records(tick))
-        tick += 1
-        live.ingest(live._subscriber.receive(0.01))
-    feed.close()
+def test_records_come_over_the_feed(live, tmp_path):
+    numbers = itertools.count()
+    with closing(ViewerFeed(feed_path(tmp_path / "control.sock"))) as feed:
+
+        def has_arrived():
+            feed.put(*tick_records(next(numbers)))
+            live.ingest(live._subscriber.receive(0.01))
+            return live.timeline.last_ns is not None
+
+        wait_until(has_arrived, 60.0)
 
 
-def test_a_page_that_stays_open_does_not_grow(page):
-    live, _ = page
+def test_a_page_that_stays_open_does_not_grow(live):
     count = round(KEEP_S * 50)
     estimate = next(record for _, record in ticks(0, 1) if isinstance(record, records.Estimate))
     for number in range(0, 3 * count, 500):
@@ -99,8 +96,7 @@ def status_with(**task):
     return {"ok": False} if task == {"none": True} else {"ok": True, "task": {"asked": requested}}
 
 
-def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(page):
-    live, _ = page
+def test_a_task_that_was_changed_before_the_page_was_opened_is_taken_over(live):
     live.ingest(ticks(0, 51))
     live._learn_task(status_with(none=True))
     live._learn_task(status_with())
@@ -115,16 +111,12 @@ def adapted(now_ns, radius_m=0.061):
 
 
 def status_of(change):
-    adaptation = {
-        "belief": "adapted",
-        "mean": dict(zip(NAMES, change.mean, strict=True)),
-        "covariance": change.covariance,
-    }
+    mean = dict(zip(NAMES, change.mean, strict=True))
+    adaptation = {"belief": "adapted", "mean": mean, "covariance": change.covariance}
     return json.loads(json.dumps({"ok": True, "adaptation": adaptation}))
 
 
-def test_a_belief_from_before_the_page_was_opened_is_taken_over(page):
-    live, _ = page
+def test_a_belief_from_before_the_page_was_opened_is_taken_over(live):
     live.ingest(ticks(0, 51))
     change = adapted(START_NS)
     live._learn_belief(status_of(change))
@@ -137,12 +129,10 @@ def test_a_belief_from_before_the_page_was_opened_is_taken_over(page):
     assert live._snapshot().belief.mean[1] == 0.062
 
 
-def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
-    live, _ = page
+def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(live):
     live.ingest(ticks(0, 2))
-    live.ingest(
-        [(live.timeline.last_ns, adapted(START_NS)), (live.timeline.last_ns, records.Adaptation(START_NS, "a", ""))]
-    )
+    change, outcome = adapted(START_NS), records.Adaptation(START_NS, "a", "")
+    live.ingest([(live.timeline.last_ns, record) for record in (change, outcome)])
     live._learn_belief({"ok": True, "adaptation": None})
     # So soon after it the status may be the older one.
     assert live._snapshot().belief.source == "adapted"
@@ -152,29 +142,17 @@ def test_a_belief_of_a_daemon_that_has_gone_is_not_the_next_ones(page):
     assert live._snapshot().adaptation is None
 
 
-def test_a_status_that_says_nothing_of_adaptation_leaves_the_models_belief(page):
-    live, _ = page
+def test_a_status_that_says_nothing_of_adaptation_leaves_the_models_belief(live):
     live.ingest(ticks(0, 51))
     live._learn_belief({"ok": True})
     assert live._snapshot().belief is None or live._snapshot().belief.source == "model"
     assert live._snapshot().adaptation is None
 
 
-def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(page):
-    live, _ = page
+def test_a_task_on_the_feed_is_newer_than_a_status_from_before_it(live):
     live.ingest(ticks(0, 51))
-    live.ingest(
-        [
-            (
-                live.timeline.last_ns,
-                records.Task(
-                    live.timeline.last_ns,
-                    "circle",
-                    {"center_x_m": 1.0, "center_y_m": 0.0, "radius_m": 0.5, "speed_m_s": 0.1},
-                ),
-            )
-        ]
-    )
+    now_ns, settings = live.timeline.last_ns, {"center_x_m": 1.0, "center_y_m": 0.0, "radius_m": 0.5, "speed_m_s": 0.1}
+    live.ingest([(now_ns, records.Task(now_ns, "circle", settings))])
     live._learn_task(status_with(radius_m=0.75))
     assert live._snapshot().task.settings["radius_m"] == 0.5
     live.ingest(ticks(51, 200))
@@ -207,8 +185,7 @@ def test_a_path_that_is_not_the_daemons_is_not_drawn_and_told(tmp_path):
 EDITED = {"center_x_m": 1.0, "center_y_m": -0.5, "radius_m": 2.0, "speed_m_s": 0.2}
 
 
-def test_a_task_that_is_edited_is_drawn_and_can_be_pulled_within_its_limits(page):
-    live, _ = page
+def test_a_task_that_is_edited_is_drawn_and_can_be_pulled_within_its_limits(live):
     live._desk.status = {"ok": False}
     live._desk.draft = dict(EDITED)
     live.draw(everything=True)
@@ -228,15 +205,13 @@ def test_a_task_that_is_edited_is_drawn_and_can_be_pulled_within_its_limits(page
     assert not any(ball.visible for ball in balls.values())
 
 
-def test_of_a_task_without_a_place_nothing_is_drawn_to_pull(page):
-    live, _ = page
+def test_of_a_task_without_a_place_nothing_is_drawn_to_pull(live):
     live._desk.status, live._desk.draft = {"ok": False}, {"speed_m_s": 0.3}
     live.draw(everything=True)
     assert not any(ball.visible for ball in live.editor.balls.values())
 
 
-def test_the_desk_is_as_dark_as_the_scene(page):
-    live, _ = page
+def test_the_desk_is_as_dark_as_the_scene(live):
     live.scene.background = DARK
     live._shade()
     assert live._desk.dark

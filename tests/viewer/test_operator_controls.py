@@ -13,13 +13,12 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from disco_hw.daemon import SERVED
-from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.viewer import operator_controls as desk_module
 from disco_hw.viewer.operator_controls import Desk, shown
 from disco_hw.viewer.server import serving
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import encode_frame
+from tests.daemon.control_daemon import ControlDaemon
 from tests.drivers.waiting import wait_until
 from tests.viewer.test_server import get
 from tools.viewer_run import ROBOT_FILE
@@ -32,38 +31,19 @@ STATUS = {
 }  # fmt: skip
 
 
-class Daemon:
-    """A control socket that accepts everything but `arm`, and keeps what it was asked; it can be made to hang."""
+class Daemon(ControlDaemon):
+    """Accepts everything but `arm`."""
 
     def __init__(self, directory):
-        directory.mkdir(mode=0o700)
-        self.server = ControlServer(directory / "control.sock", SERVED)
-        self.received, self.hangs, self._ending = [], False, threading.Event()
         self.status = STATUS
-        self._thread = threading.Thread(target=self._serve)
-        self._thread.start()
+        super().__init__(directory / "control.sock", self._reply_to)
 
-    def _serve(self):
-        while not self._ending.is_set():
-            for message in [] if self.hangs else self.server.poll():
-                self.received.append((message.action, message.arguments))
-                self.server.reply(message, self._reply(message))
-            time.sleep(0.002)
-
-    def _reply(self, message):
+    def _reply_to(self, message):
         if message.action == "status":
             return self.status
         if message.action == "drive":
             return {"ok": True, "stamp": str(1_000 + len(self.received))}
         return {"ok": message.action != "arm", "text": "done it", "error": "not now"}
-
-    def actions(self, *but):
-        return [action for action, _ in self.received if action not in but]
-
-    def close(self):
-        self._ending.set()
-        self._thread.join()
-        self.server.close()
 
 
 @pytest.fixture
@@ -96,6 +76,19 @@ def line_to(port, origin=None):
         yield line
 
 
+@pytest.fixture
+def port(daemon):
+    """The port of a desk beside the daemon."""
+    with desk_of(daemon.server.path) as (_, port):
+        yield port
+
+
+@pytest.fixture
+def line(port):
+    with line_to(port) as line:
+        yield line
+
+
 def next_message(line, kind, timeout_s=60.0):
     """The next message of that kind."""
     deadline = time.monotonic() + timeout_s
@@ -118,30 +111,23 @@ def request_reply(line, **request):
     return next_message(line, "drive" if request["do"] == "drive" else "reply")
 
 
-def test_every_button_asks_the_daemon_and_tells_its_answer(daemon):
-    with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
-        for action in desk_module.REQUESTS:
-            reply = request_reply(line, do=action)
-            assert reply["do"] == action
-            assert reply["ok"] is (action != "arm")
-            assert "not now" in reply["error"]
+def test_every_button_asks_the_daemon_and_tells_its_answer(daemon, line):
+    for action in desk_module.REQUESTS:
+        reply = request_reply(line, do=action)
+        assert reply["do"] == action
+        assert reply["ok"] is (action != "arm")
+        assert "not now" in reply["error"]
     assert daemon.actions("status", "drive") == list(desk_module.REQUESTS)
-
-
-def test_the_task_goes_through_with_its_numbers(daemon):
-    with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
-        request_reply(line, do="task", radius_m=0.5, speed_m_s=0.1)
+    request_reply(line, do="task", radius_m=0.5, speed_m_s=0.1)
     assert ("task", {"radius_m": 0.5, "speed_m_s": 0.1}) in daemon.received
 
 
-def test_what_is_no_request_of_the_page_does_not_reach_the_daemon(daemon):
-    with desk_of(daemon.server.path) as (_, port):
-        with line_to(port) as line:
-            assert "no such request" in request_reply(line, do="quit")["error"]
-        for garbage in ("", "[1]", '{"do": 1}', "{" * 100_000, b"\xff"):
-            with line_to(port) as line:
-                line.send(garbage)
-                assert hung_up(line)
+def test_what_is_no_request_of_the_page_does_not_reach_the_daemon(daemon, port, line):
+    assert "no such request" in request_reply(line, do="quit")["error"]
+    for garbage in ("", "[1]", '{"do": 1}', "{" * 100_000, b"\xff"):
+        with line_to(port) as another:
+            another.send(garbage)
+            assert hung_up(another)
     assert daemon.actions("status", "drive") == []
 
 
@@ -183,28 +169,26 @@ def test_the_estop_takes_the_link_that_the_daemon_was_given(tmp_path):
     os.close(slave)
 
 
-def test_the_estop_is_not_behind_requests_that_hang(daemon, monkeypatch):
+def test_the_estop_is_not_behind_requests_that_hang(line, monkeypatch):
     """All threads for other requests wait for a daemon that hangs; the stop does not wait for them."""
     stopped, released = threading.Event(), threading.Event()
     monkeypatch.setattr(Desk, "request", lambda self, request: {"ok": released.wait(120.0)})
     monkeypatch.setattr(Desk, "estop", lambda self: stopped.set() or {"do": "estop", "ok": True, "text": "stopped"})
-    with desk_of(daemon.server.path) as (_, port), line_to(port) as line:
-        for _ in range(20):
-            line.send(json.dumps({"do": "start"}))
-        line.send(json.dumps({"do": "estop"}))
-        try:
-            assert stopped.wait(60.0)
-        finally:
-            released.set()
+    for _ in range(20):
+        line.send(json.dumps({"do": "start"}))
+    line.send(json.dumps({"do": "estop"}))
+    try:
+        assert stopped.wait(60.0)
+    finally:
+        released.set()
 
 
-def test_the_pad_has_a_line_of_its_own_and_is_opened_when_the_page_goes(daemon):
+def test_the_pad_has_a_line_of_its_own_and_is_opened_when_the_page_goes(daemon, port):
     hold = {"do": "drive", "forward": 0.5, "left": 0.0, "held": True}
-    with desk_of(daemon.server.path) as (_, port):
-        with line_to(port) as line:
-            first = request_reply(line, stamp="0", **hold)
-            assert request_reply(line, stamp=first["stamp"], **hold)["ok"]
-        wait_until(lambda: [of.get("held") for what, of in daemon.received if what == "drive"][-1:] == [False], 30.0)
+    with line_to(port) as line:
+        first = request_reply(line, stamp="0", **hold)
+        assert request_reply(line, stamp=first["stamp"], **hold)["ok"]
+    wait_until(lambda: [of.get("held") for what, of in daemon.received if what == "drive"][-1:] == [False], 30.0)
     drives = [arguments for action, arguments in daemon.received if action == "drive"]
     assert [drive["held"] for drive in drives] == [True, True, False]
     assert drives[1]["stamp"] == first["stamp"]
@@ -230,23 +214,22 @@ def test_two_pages_see_the_same_robot(daemon):
         assert desk.status["state"] == "READY"
 
 
-def test_nobody_there_asks_nothing_of_the_daemon(daemon):
-    with desk_of(daemon.server.path) as (_, port):
-        with line_to(port) as line:
-            next_message(line, "status")
+def test_nobody_there_asks_nothing_of_the_daemon(daemon, port):
+    with line_to(port) as line:
+        next_message(line, "status")
 
-        def is_quiet():
-            count = len(daemon.received)
-            time.sleep(0.6)
-            return len(daemon.received) == count
+    def is_quiet():
+        count = len(daemon.received)
+        time.sleep(0.6)
+        return len(daemon.received) == count
 
-        # The page may take its time to notice that its browser has gone.
-        wait_until(is_quiet, 30.0)
+    # The page may take its time to notice that its browser has gone.
+    wait_until(is_quiet, 30.0)
 
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "null"])
-def test_a_foreign_page_gets_no_line(daemon, origin):
-    with desk_of(daemon.server.path) as (_, port), pytest.raises(InvalidStatus), line_to(port, origin):
+def test_a_foreign_page_gets_no_line(daemon, port, origin):
+    with pytest.raises(InvalidStatus), line_to(port, origin):
         pass
     assert daemon.received == []
 
@@ -269,21 +252,20 @@ def test_with_another_address_there_is_no_control_without_its_token(daemon):
             assert request_reply(line, do="stop")["ok"]
 
 
-def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(daemon):
-    with desk_of(daemon.server.path) as (_, port):
-        cookie = {"Cookie": COOKIES[port]}
-        response, body = get(port, **cookie)
-        assert b"E-STOP" in body
-        assert b"@@" not in body
-        assert response.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
-        response, scene = get(port, "/index.html", **cookie)
-        assert b"E-STOP" not in scene
-        assert f"http://127.0.0.1:{port}" in response.getheader("Content-Security-Policy")
-        local, instance = get(port, "/instance", Origin=f"http://localhost:{port}")
-        assert instance.strip() in body
-        assert local.getheader("Access-Control-Allow-Origin") == f"http://localhost:{port}"
-        foreign, _ = get(port, "/instance", Origin="http://evil.example")
-        assert foreign.getheader("Access-Control-Allow-Origin") is None
+def test_the_desk_is_what_opens_and_nobody_else_may_frame_it(port):
+    cookie = {"Cookie": COOKIES[port]}
+    response, body = get(port, **cookie)
+    assert b"E-STOP" in body
+    assert b"@@" not in body
+    assert response.getheader("Content-Security-Policy") == "frame-ancestors 'none'"
+    response, scene = get(port, "/index.html", **cookie)
+    assert b"E-STOP" not in scene
+    assert f"http://127.0.0.1:{port}" in response.getheader("Content-Security-Policy")
+    local, instance = get(port, "/instance", Origin=f"http://localhost:{port}")
+    assert instance.strip() in body
+    assert local.getheader("Access-Control-Allow-Origin") == f"http://localhost:{port}"
+    foreign, _ = get(port, "/instance", Origin="http://evil.example")
+    assert foreign.getheader("Access-Control-Allow-Origin") is None
 
 
 @pytest.mark.parametrize(
@@ -310,7 +292,7 @@ def test_a_latched_stop_and_a_drive_by_page_are_shown():
     assert display["drive"] == {"by_page": True, "driving": False}
 
 
-def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_task(daemon, monkeypatch):
+def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_task(port, monkeypatch):
     tasks, forward, requested, answered = [], Desk._forward_request, threading.Event(), threading.Event()
 
     async def watched(self, *arguments):
@@ -323,19 +305,17 @@ def test_a_request_still_unanswered_when_the_browser_goes_goes_on_and_leaves_no_
 
     monkeypatch.setattr(Desk, "_forward_request", watched)
     monkeypatch.setattr(Desk, "request", unanswered)
-    with desk_of(daemon.server.path) as (_, port):
-        with line_to(port) as line:
-            line.send(json.dumps({"do": "disarm"}))
-            assert requested.wait(60.0)
-        wait_until(tasks[0].done, 30.0)
-        answered.set()
+    with line_to(port) as line:
+        line.send(json.dumps({"do": "disarm"}))
+        assert requested.wait(60.0)
+    wait_until(tasks[0].done, 30.0)
+    answered.set()
 
 
-def test_an_estop_that_is_the_last_word_of_a_browser_is_made(daemon, monkeypatch):
+def test_an_estop_that_is_the_last_word_of_a_browser_is_made(port, monkeypatch):
     stops = []
     monkeypatch.setattr(Desk, "estop", lambda _: stops.append(True) or {"ok": True})
-    with desk_of(daemon.server.path) as (_, port):
-        for count in range(1, 11):
-            with line_to(port) as line:
-                line.send(json.dumps({"do": "estop"}))
-            wait_until(lambda count=count: len(stops) == count, 30.0)
+    for count in range(1, 11):
+        with line_to(port) as line:
+            line.send(json.dumps({"do": "estop"}))
+        wait_until(lambda count=count: len(stops) == count, 30.0)

@@ -33,9 +33,11 @@ STATUS = {
 }  # fmt: skip
 
 
-def test_the_details_say_where_every_tick_has_gone_and_what_fails():
-    text = live_details(STATUS, None, 0, None)
-    assert "| recording | run.mcap: 80 of 100 ticks, 7 waiting, 10 dropped, 3 lost with a deleted file |" in text
+def shot_at(timeline, tick, plan=None):
+    return snapshot_at(timeline, START_NS + tick * PERIOD_NS, plan)
+
+
+def test_what_fails_is_in_the_summary():
     assert "FAILS" not in live_summary(STATUS, None)
     failing = STATUS | {"recorder": STATUS["recorder"] | {"fault": "nothing is being recorded: no room"}}
     assert "| RECORDING FAILS | nothing is being recorded: no room |" in live_summary(failing, None)
@@ -51,22 +53,23 @@ def test_of_several_pose_sources_the_details_say_how_each_does():
     assert "poses" not in live_details({**STATUS, "poses": alone}, None, 0, None)
 
 
-def test_without_a_status_the_page_says_how_old_it_is():
+def test_the_details_add_up_where_every_tick_has_gone_and_what_went_wrong(timeline):
+    text = live_details(STATUS, shot_at(timeline, 50, plan_at(50)), 0, None)
+    for row in (
+        "| recording | run.mcap: 80 of 100 ticks, 7 waiting, 10 dropped, 3 lost with a deleted file |",
+        "| rejected, lost | 6, 5 |",
+        "| loop late p99, max | 100, 900 us |",
+        "| overruns, skipped | 7, 8 |",
+        "| bus errors | 0 sent, 0 received, 0 bus-off |",
+        "rad/s (plan)",
+    ):
+        assert row in text
+    assert "battery" not in text
     assert "| page is behind | 12 ms, 3 batches missed |" in live_details(None, None, 3, 12.4)
 
 
-def test_the_details_add_up_what_went_wrong(timeline):
-    text = live_details(STATUS, snapshot_at(timeline, START_NS + 50 * PERIOD_NS, plan_at(50)), 0, None)
-    assert "| rejected, lost | 6, 5 |" in text
-    assert "| loop late p99, max | 100, 900 us |" in text
-    assert "| overruns, skipped | 7, 8 |" in text
-    assert "battery" not in text
-    assert "| bus errors | 0 sent, 0 received, 0 bus-off |" in text
-    assert "rad/s (plan)" in text
-
-
 def test_what_matters_comes_first_in_metres_and_the_counters_after_it(timeline):
-    text = live_summary(STATUS, snapshot_at(timeline, START_NS + 50 * PERIOD_NS, plan_at(50)))
+    text = live_summary(STATUS, shot_at(timeline, 50, plan_at(50)))
     rows = [line.split("|")[1].strip() for line in text.splitlines()[2:]]
     assert rows == ["laps", "distance", "speed", "battery", "loop"]
     assert "| distance | 0.012 m |" in text
@@ -77,12 +80,13 @@ def test_what_matters_comes_first_in_metres_and_the_counters_after_it(timeline):
 
 
 def test_a_replay_shows_the_same_motion_and_the_distance(timeline):
-    text = replay_text(snapshot_at(timeline, START_NS + 70 * PERIOD_NS, None), START_NS, CircleTask(radius_m=0.5))
+    shot = shot_at(timeline, 70)
+    text = replay_text(shot, START_NS, CircleTask(radius_m=0.5))
     assert text.startswith("### ARMED")
     assert "| time | 1.400 s |" in text
     assert "| distance | 0.250 m |" in text
     assert "bus errors" not in text
-    assert "bus errors" in replay_details(snapshot_at(timeline, START_NS + 70 * PERIOD_NS, None))
+    assert "bus errors" in replay_details(shot)
     assert "Overcurrent" in text
 
 
@@ -122,7 +126,7 @@ def test_an_empty_instant_can_be_shown():
 
 
 def test_events_are_listed_newest_first(timeline):
-    text = events_text(snapshot_at(timeline, START_NS + 50 * PERIOD_NS, None), START_NS)
+    text = events_text(shot_at(timeline, 50), START_NS)
     assert "0.20 s" in text
     assert "armed on request" in text
 
@@ -142,13 +146,7 @@ def test_numbers_that_are_none_become_a_dash():
 
 
 def test_of_a_path_the_panel_tells_the_progress_and_the_side():
-    task = {
-        "laps": 0.25,
-        "distance_m": -0.012,
-        "length_m": 8.0,
-        "progress": ["progress", "2.00 of 8.00 m (25%)"],
-        "asked": {"kind": "path"},
-    }
+    task = {"laps": 0.25, "distance_m": -0.012, "progress": ["progress", "2.00 of 8.00 m (25%)"]}
     text = live_summary({**STATUS, "task": task}, None)
     assert "| progress | 2.00 of 8.00 m (25%) |" in text
     assert "| distance | -0.012 m |" in text

@@ -1,4 +1,4 @@
-"""The picture without a browser: everything of the page's top view is in it, in its colour and at its place."""
+"""Pictures, clips and exported pages of a log, without a browser; test_commands.py has what is in an exported page."""
 
 import numpy as np
 import pytest
@@ -9,13 +9,14 @@ from disco_hw.viewer import picture, scene
 from tools.viewer_run import FAN_TICK
 
 
+def count(pixels, colour, tolerance=12):
+    """Count the pixels of a picture (height, width, 3) that have this colour."""
+    return int((np.abs(pixels - colour).max(axis=2) <= tolerance).sum())
+
+
 def pixels_of(recording, t_s, path):
     picture.draw_picture(recording, t_s, path)
     return np.asarray(Image.open(path).convert("RGB")).astype(int)
-
-
-def count(pixels, colour, tolerance=12):
-    return int((np.abs(pixels - colour).max(axis=2) <= tolerance).sum())
 
 
 def count_shades(pixels, colour, palest):
@@ -32,6 +33,20 @@ def test_every_layer_is_in_the_picture(recording, tmp_path):
     assert count(pixels, scene.LAYERS["plan"].colour) > 50
     assert count_shades(pixels, scene.LAYERS["fan"].colour, 0.2) > 60
     assert count(pixels, scene.LAYERS["ellipse"].colour) > 10
+
+
+def test_a_longer_log_is_exported_with_pictures_further_apart(recording, tmp_path, monkeypatch):
+    monkeypatch.setattr(picture, "_MOST_PICTURES", 5)
+    parts = []
+    picture.export_html(recording, tmp_path / "run.html", parts.append)
+    assert len(parts) == 6
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
+
+
+def test_an_export_to_where_nothing_can_be_written_is_told(recording, tmp_path):
+    with pytest.raises(InputError, match="cannot be written"):
+        picture.export_html(recording, tmp_path / "none" / "run.html", lambda part: None)
 
 
 def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path, monkeypatch):

@@ -1,9 +1,9 @@
 import pytest
 
 from disco_hw.errors import InputError
-from disco_hw.viewer.recording import Recording
+from disco_hw.viewer.recording import Recording, stage_of_robot
 from tests.runtime.simulated import write_ticks
-from tools.viewer_run import ROBOT_FILE, plan_at, pose_at, tick_records
+from tools.viewer_run import MODEL_FILE, ROBOT_FILE, plan_at, pose_at, tick_records
 
 
 def test_a_log_is_shown_as_it_was_recorded(recording, timeline):
@@ -47,3 +47,20 @@ def test_what_is_no_log_is_told(tmp_path):
         Recording(tmp_path / "missing.mcap")
     with pytest.raises(InputError):
         Recording(ROBOT_FILE)
+
+
+def test_the_stage_is_that_of_the_robot_file_and_its_model():
+    stage = stage_of_robot(ROBOT_FILE)
+    assert (stage.name, stage.task.radius_m, stage.wheel_radius_m) == ("wombot", 0.75, 0.06)
+    assert stage.x_icr_m == 0.238, "the model's, not the nominal one"
+
+
+def test_a_log_brings_both_files(recording):
+    expected = stage_of_robot(ROBOT_FILE, MODEL_FILE)
+    assert recording.stage.task == expected.task
+    assert recording.stage.model.belief.mean().tolist() == expected.model.belief.mean().tolist()
+
+
+def test_a_robot_file_that_is_none_is_told(tmp_path):
+    with pytest.raises(InputError, match=r"none\.toml"):
+        stage_of_robot(tmp_path / "none.toml")

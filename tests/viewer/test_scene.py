@@ -71,7 +71,7 @@ def test_nothing_known_draws_the_task_alone(scene):
     assert [layer for layer in LAYERS if node(scene, layer).visible] == ["task", "fence"]
 
 
-def test_the_robot_stands_at_its_pose_and_its_wheels_turn_as_measured(scene, shot):
+def test_the_robot_is_to_scale_and_stands_at_its_pose_and_its_wheels_turn_as_measured(scene, shot, stage):
     scene.show(shot)
     x_m, y_m, yaw_rad = pose_at(TICK)
     assert scene._robot.position[:2] == pytest.approx((x_m, y_m))
@@ -79,9 +79,6 @@ def test_the_robot_stands_at_its_pose_and_its_wheels_turn_as_measured(scene, sho
     for wheel, angle in zip(scene._wheels, (*shot.wheel_angles, *shot.wheel_angles), strict=True):
         assert wheel.wxyz[2] == pytest.approx(math.sin(angle / 2), abs=1e-6)
     assert {tuple(np.sign(wheel.position[:2])) for wheel in scene._wheels} == {(1, 1), (1, -1), (-1, 1), (-1, -1)}
-
-
-def test_the_robot_is_to_scale(scene, stage):
     across = {round(abs(wheel.position[1]), 6) for wheel in scene._wheels}
     assert across == {round(stage.axial_distance_m / 2, 6)}
     assert {wheel.position[2] for wheel in scene._wheels} == {stage.wheel_radius_m}
@@ -193,13 +190,11 @@ def test_the_fan_is_shaded_by_weight_and_the_weightiest_lies_on_top(scene, shot)
     assert strengths[0] > strengths[1] > strengths[2] > 0
     assert points[0, 0, 2] > points[2, 0, 2] > points[4, 0, 2]
     assert tuple(colours[0, 0]) == scene_module.LAYERS["fan"].colour
-    scene.show(replace(shot, fan=None))
-    assert not scene._lines["fan"].visible
-
-
-def test_a_fan_that_is_broken_is_not_drawn(scene, shot):
-    scene.show(replace(shot, fan=records.Fan(0, (0.5, 0.5), (1.0, 2.0, 3.0), (1.0, 2.0, 3.0))))
-    assert not scene._lines["fan"].visible
+    for broken_or_none in (records.Fan(0, (0.5, 0.5), (1.0, 2.0, 3.0), (1.0, 2.0, 3.0)), None):
+        scene.show(shot)
+        assert scene._lines["fan"].visible
+        scene.show(replace(shot, fan=broken_or_none))
+        assert not scene._lines["fan"].visible
 
 
 def test_an_adapted_belief_bends_the_plan_under_its_sigma_points(scene, shot, stage):

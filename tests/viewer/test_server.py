@@ -30,7 +30,7 @@ def page():
 
 def cookie_of(page):
     """Return the cookie that a browser sends once it has opened the printed address."""
-    return {"Cookie": f"disco-hw-token-{port_of(page)}={urlsplit(page.url).query.removeprefix('token=')}"}
+    return {"Cookie": f"disco-hw-token-{port_of(page)}={token_of(page)}"}
 
 
 def get(port, path="/", host=None, **headers):
@@ -42,9 +42,19 @@ def get(port, path="/", host=None, **headers):
     return response, body
 
 
-def upgrade(port, origin, headers=None):
-    address = f"ws://127.0.0.1:{port}/"
+def upgrade(port, origin, headers=None, path="/"):
+    address = f"ws://127.0.0.1:{port}{path}"
     return connect(address, origin=origin, subprotocols=[SUBPROTOCOL], additional_headers=headers, open_timeout=60)
+
+
+def assert_no_upgrade(port, origin, headers=None, path="/"):
+    with pytest.raises(InvalidStatus) as refused, upgrade(port, origin, headers, path):
+        pass
+    assert refused.value.response.status_code == 403
+
+
+def token_of(page):
+    return urlsplit(page.url).query.removeprefix("token=")
 
 
 def port_of(page):
@@ -70,12 +80,7 @@ def test_another_user_of_this_machine_gets_nothing_without_the_token(page, path)
     assert response.status == 403
     assert b"open the address with its token" in body
     for headers in ({}, {"Cookie": f"disco-hw-token-{port}=wrong"}):
-        with pytest.raises(InvalidStatus) as refused:
-            connect(
-                f"ws://127.0.0.1:{port}{path}", origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL],
-                additional_headers=headers, open_timeout=60,
-            )  # fmt: skip
-        assert refused.value.response.status_code == 403
+        assert_no_upgrade(port, f"http://127.0.0.1:{port}", headers, path)
 
 
 def test_the_printed_address_lets_in_and_the_cookie_keeps(page):
@@ -91,8 +96,7 @@ def test_the_printed_address_lets_in_and_the_cookie_keeps(page):
 def test_the_scene_gets_in_by_its_address_as_its_name_has_no_cookie(page):
     port, query = port_of(page), urlsplit(page.url).query
     assert get(port, f"/index.html?{query}", host=f"localhost:{port}")[0].status == 200
-    address = f"ws://127.0.0.1:{port}/?{query}"
-    with connect(address, origin=f"http://127.0.0.1:{port}", subprotocols=[SUBPROTOCOL], open_timeout=60) as client:
+    with upgrade(port, f"http://127.0.0.1:{port}", path=f"/?{query}") as client:
         assert client.recv(timeout=60)
 
 
@@ -110,14 +114,12 @@ def test_where_somebody_listens_there_already_the_token_is_not_handed_on(tmp_pat
         stranger.listen(1)
         port = stranger.getsockname()[1]
         with serving("test", port=port, desk=desk) as served:
-            token = urlsplit(served.url).query.removeprefix("token=")
-            assert token.encode() not in get(port, **cookie_of(served))[1]
+            assert token_of(served).encode() not in get(port, **cookie_of(served))[1]
     with (
         closing(Desk(tmp_path / "none.sock", tmp_path / "none.toml")) as other,
         serving("t", port=0, desk=other) as alone,
     ):
-        token = urlsplit(alone.url).query.removeprefix("token=")
-        assert token.encode() in get(port_of(alone), **cookie_of(alone))[1]
+        assert token_of(alone).encode() in get(port_of(alone), **cookie_of(alone))[1]
 
 
 def test_the_token_of_the_environment_is_taken_and_a_short_one_refused(monkeypatch):
@@ -132,9 +134,7 @@ def test_the_token_of_the_environment_is_taken_and_a_short_one_refused(monkeypat
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:1", "null", None])
 def test_a_foreign_page_may_not_connect(page, origin):
-    with pytest.raises(InvalidStatus) as refused, upgrade(port_of(page), origin, cookie_of(page)):
-        pass
-    assert refused.value.response.status_code == 403
+    assert_no_upgrade(port_of(page), origin, cookie_of(page))
 
 
 def test_a_foreign_name_for_this_machine_is_refused(page):
@@ -181,8 +181,7 @@ def test_the_library_is_left_as_it_was(page):
 
 def test_another_address_needs_its_token():
     with serving("test", host="0.0.0.0", port=0) as served:
-        address = urlsplit(served.url)
-        port, token = address.port, address.query.removeprefix("token=")
+        port, token = port_of(served), token_of(served)
         assert len(token) >= 16
         assert get(port)[0].status == 403
         assert get(port, "/?token=wrong")[0].status == 403
@@ -195,10 +194,8 @@ def test_another_address_needs_its_token():
         pair = cookie.split(";")[0]
         assert get(port, Cookie=pair)[0].status == 200
         page_origin = f"http://127.0.0.1:{port}"
-        with pytest.raises(InvalidStatus), upgrade(port, page_origin):
-            pass
-        with pytest.raises(InvalidStatus), upgrade(port, "http://evil.example", headers={"Cookie": pair}):
-            pass
+        assert_no_upgrade(port, page_origin)
+        assert_no_upgrade(port, "http://evil.example", {"Cookie": pair})
         with upgrade(port, page_origin, headers={"Cookie": pair}) as client:
             assert client.recv(timeout=60)
 

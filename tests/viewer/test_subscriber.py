@@ -77,7 +77,12 @@ def test_gaps_in_the_numbers_are_counted_and_a_new_daemon_is_none(ends):
     assert subscriber.missed == 3
 
 
-@pytest.mark.parametrize("garbage", [b"", b"\xff" * 20, b"[1]", msgspec.msgpack.encode({"a": 1})])
+UNKNOWN_RECORD = msgspec.msgpack.encode([1, 2, [[99, None]]])
+
+
+@pytest.mark.parametrize(
+    "garbage", [b"", b"\xc1", b"\xff" * 20, b"[1]", msgspec.msgpack.encode({"a": 1}), UNKNOWN_RECORD]
+)
 def test_what_is_none_of_the_daemons_is_counted_and_dropped(ends, garbage):
     daemon, subscriber = ends
     number = connected(daemon, subscriber)

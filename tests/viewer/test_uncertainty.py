@@ -9,14 +9,19 @@ from disco_hw.viewer.recording import ParameterPoints
 from tools.viewer_run import MODEL_FILE, plan_at
 
 
+def start_and_commands(plan):
+    """Where a plan starts, with wheels at 1 and 2 rad/s, and its wheel speeds."""
+    start = np.array([plan.path_x_m[0], plan.path_y_m[0], plan.path_yaw_rad[0], 1.0, 2.0])
+    return start, np.column_stack((plan.left_rad_s, plan.right_rad_s))
+
+
 def test_paths_are_those_of_the_compiled_model():
     model = load_model(MODEL_FILE)
     plan = plan_at(0)
     paths = ParameterPoints(model).trajectories(plan, (1.0, 2.0))
     points, _ = unscented_points(model, 1.0)
     runs = FreeRun(model, points, plan.step_s)
-    start = np.array([plan.path_x_m[0], plan.path_y_m[0], plan.path_yaw_rad[0], 1.0, 2.0])
-    commands = np.column_stack((plan.left_rad_s, plan.right_rad_s))
+    start, commands = start_and_commands(plan)
     assert paths.shape == (len(points), 11, 2)
     assert len(points) == 7
     for index, path in enumerate(paths):
@@ -29,8 +34,7 @@ def test_a_robot_that_remembers_is_taken_to_have_done_the_same_before():
     effects = tuple(EffectSetting(name, {"k": k}) for name, k in terms.items())
     model, plan = Model(0.06, 0.3, 0.1, effects), plan_at(0)
     (path,) = ParameterPoints(model).trajectories(plan, (1.0, 2.0))
-    commands = np.column_stack((plan.left_rad_s, plan.right_rad_s))
-    start = np.array([plan.path_x_m[0], plan.path_y_m[0], plan.path_yaw_rad[0], 1.0, 2.0])
+    start, commands = start_and_commands(plan)
     load = np.abs(commands[0]).sum()
     run = FreeRun(model, model.point()[None], plan.step_s)
     expected = run.states(start, commands, 0, means=np.array([load, load, 2.0 - 1.0]))[:, :2]
@@ -38,14 +42,10 @@ def test_a_robot_that_remembers_is_taken_to_have_done_the_same_before():
     assert np.abs(path - run.states(start, commands, 0)[:, :2]).max() > 1e-3
 
 
-def test_a_point_estimate_gives_one_path():
-    model = Model(0.06, 0.3, 0.1)
-    assert ParameterPoints(model).trajectories(plan_at(0), (0.0, 0.0)).shape == (1, 11, 2)
-
-
-def test_no_path_of_a_plan_without_one():
-    plan = records.Plan(0, 0, 0.1, (1.0,), (1.0,))
-    assert ParameterPoints(Model(0.06, 0.3)).trajectories(plan, (0.0, 0.0)).shape == (0, 0, 2)
+def test_a_point_estimate_gives_one_path_and_none_of_a_plan_without_one():
+    points = ParameterPoints(Model(0.06, 0.3, 0.1))
+    assert points.trajectories(plan_at(0), (0.0, 0.0)).shape == (1, 11, 2)
+    assert points.trajectories(records.Plan(0, 0, 0.1, (1.0,), (1.0,)), (0.0, 0.0)).shape == (0, 0, 2)
 
 
 def test_three_times_the_uncertainty_fans_out_three_times_as_far():

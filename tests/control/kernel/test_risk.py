@@ -21,6 +21,13 @@ def run_worst(costs, point_costs, weights, blocks, part, order):
     worst_over_points(costs, point_costs, weights, blocks, part, order)
 
 
+def worst(point_costs, weights, part):
+    """Costs (B,) of the worst part under all points."""
+    costs = aligned_zeros(B)
+    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(part), np.zeros(7, np.int64))
+    return costs
+
+
 @pytest.fixture
 def case():
     rng = np.random.default_rng(3)
@@ -38,17 +45,14 @@ def test_mean_adds_to_what_is_there(case):
 
 @pytest.mark.parametrize("part", [0.05, 0.25, 0.6, 0.99])
 def test_cvar_is_the_mean_of_the_worst_part(case, part):
-    point_costs, weights = case
-    costs = aligned_zeros(B)
-    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(part), np.zeros(7, np.int64))
-    np.testing.assert_allclose(costs, oracle.cvar_risk(point_costs, weights, part), rtol=1e-5)
+    np.testing.assert_allclose(worst(*case, part), oracle.cvar_risk(*case, part), rtol=1e-5)
 
 
-def test_a_vanishing_part_is_the_worst_point(case):
+def test_a_vanishing_part_is_the_worst_point_of_a_weight(case):
     point_costs, weights = case
-    costs = aligned_zeros(B)
-    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(1e-6), np.zeros(7, np.int64))
-    np.testing.assert_allclose(costs, point_costs.max(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(worst(point_costs, weights, 1e-6), point_costs.max(axis=0), rtol=1e-6)
+    weights[0], point_costs[0] = 0.0, 1e3
+    np.testing.assert_allclose(worst(point_costs, weights, 1e-6), point_costs[1:].max(axis=0), rtol=1e-6)
 
 
 @pytest.mark.parametrize("place", [0, 3, 6])
@@ -56,14 +60,4 @@ def test_a_vanishing_part_is_the_worst_point(case):
 def test_a_point_under_which_a_sequence_has_no_cost_is_its_worst(case, part, place):
     point_costs, weights = case
     point_costs[place, 5] = np.nan
-    costs = aligned_zeros(B)
-    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(part), np.zeros(7, np.int64))
-    assert np.flatnonzero(np.isnan(costs)).tolist() == [5]
-
-
-def test_points_of_weight_zero_do_not_count(case):
-    point_costs, weights = case
-    weights[0], point_costs[0] = 0.0, 1e3
-    costs = aligned_zeros(B)
-    run_worst(costs, point_costs.ravel(), weights, 1, np.float32(1e-6), np.zeros(7, np.int64))
-    np.testing.assert_allclose(costs, point_costs[1:].max(axis=0), rtol=1e-6)
+    assert np.flatnonzero(np.isnan(worst(point_costs, weights, part))).tolist() == [5]

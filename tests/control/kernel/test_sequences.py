@@ -18,6 +18,7 @@ from disco_hw.control.kernel.sequences import (
     expand,
     mean_noise,
     pull_on_knots,
+    row_sum,
     sum_lanes,
 )
 from disco_hw.control.optimiser import spline_basis
@@ -143,3 +144,23 @@ def test_the_mean_noise_over_time_comes_from_the_sums_of_its_rows(basis):
     run_weighted(sums, np.full(B, 1.0 / B, F32), 1, noise, noise.size, 0, rows)
     run_mean_noise(out, sums, basis)
     np.testing.assert_allclose(out, over_time.mean(axis=0), atol=1e-5)
+
+
+@kernel_function
+def run_row_sum(rows, first):
+    return row_sum(rows, U(first))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(0, 2))
+def test_a_row_is_summed(seed, row):
+    rows = np.random.default_rng(seed).uniform(-1.0, 1.0, 3 * B).astype(np.float32)
+    expected = rows[row * B : (row + 1) * B].astype(float).sum()
+    np.testing.assert_allclose(run_row_sum(rows, row * B), expected, atol=1e-5)
+
+
+def test_what_is_not_finite_stays_visible_in_the_sum_of_a_row():
+    for at in range(B):
+        for value in (np.nan, np.inf):
+            rows = np.zeros(B, np.float32)
+            rows[at] = value
+            assert not np.isfinite(run_row_sum(rows, 0))

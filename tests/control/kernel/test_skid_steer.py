@@ -177,22 +177,15 @@ def check_against_reference(model, state, task, plan_settings, seed):
     past = command_history(state.sent, now_ns, STEP_S, 8, (state.left_speed_rad_s, state.right_speed_rad_s))
     start = physics.RobotState(state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s)
 
+    options = {"time_s": state.elapsed_s, "euler": plan_settings.euler}
+
     def costs_of(sequences, x_m=0.0, y_m=0.0, farther=1.0):
         cost = sequence_cost(task, disco._memory, disco.chassis.x_icr_m, farther)
         names = model.parameter_names
         begin = replace(start, x=start.x + x_m, y=start.y + y_m)
         return np.array(
             [
-                oracle.point_costs(
-                    physics.theta_of(names, point),
-                    begin,
-                    sequences,
-                    past,
-                    STEP_S,
-                    cost,
-                    time_s=state.elapsed_s,
-                    euler=plan_settings.euler,
-                )
+                oracle.point_costs(physics.theta_of(names, point), begin, sequences, past, STEP_S, cost, **options)
                 for point in theta[weighed]
             ]
         )
@@ -252,33 +245,16 @@ def test_costs_and_update_with_euler_steps(base, values, commands, seed):
 
 
 @pytest.mark.long
+@pytest.mark.parametrize(
+    ("effects", "changes"),
+    [(st.none(), {}), (st.none(), {"ut_alpha": 0.5}), (EFFECTS, {}), (EFFECTS, {"euler": True})],
+    ids=["bare", "with a weight of the mean", "all effects", "all effects in Euler steps"],
+)
 @settings(max_examples=15)
-@given(BASE, EFFECTS, STATES, COMMANDS, SEEDS)
-def test_costs_and_update_with_euler_steps_and_all_effects(base, effects, values, commands, seed):
-    plan_settings = replace(PLAN_SETTINGS, euler=True)
-    check_against_reference(model_of(base, effects), state_of(values, commands), CIRCLE, plan_settings, seed)
-
-
-@pytest.mark.long
-@settings(max_examples=15)
-@given(BASE, STATES, COMMANDS, SEEDS)
-def test_costs_and_update_of_a_bare_model_that_turns_fast(base, values, commands, seed):
-    check_against_reference(model_of(base), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
-
-
-@pytest.mark.long
-@settings(max_examples=15)
-@given(BASE, STATES, COMMANDS, SEEDS)
-def test_costs_and_update_where_the_mean_has_a_weight(base, values, commands, seed):
-    plan_settings = replace(PLAN_SETTINGS, ut_alpha=0.5)
-    check_against_reference(model_of(base), state_of(values, commands), CIRCLE, plan_settings, seed)
-
-
-@pytest.mark.long
-@settings(max_examples=15)
-@given(BASE, EFFECTS, STATES, COMMANDS, SEEDS)
-def test_costs_and_update_with_all_effects(base, effects, values, commands, seed):
-    check_against_reference(model_of(base, effects), state_of(values, commands), CIRCLE, PLAN_SETTINGS, seed)
+@given(BASE, st.data(), STATES, COMMANDS, SEEDS)
+def test_costs_and_update_of_a_model_that_turns_fast(effects, changes, base, data, values, commands, seed):
+    model = model_of(base, data.draw(effects))
+    check_against_reference(model, state_of(values, commands), CIRCLE, replace(PLAN_SETTINGS, **changes), seed)
 
 
 STRAIGHT_BACK = np.array([[0.0, 0.0], [-1.61291931, 0.66600324], [0.0, 0.0]])

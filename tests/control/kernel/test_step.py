@@ -1,11 +1,14 @@
-"""The compiled step: the shift by fractions, and that it takes nothing from the heap."""
+"""The compiled step: the shift by fractions, nothing taken from the heap, and what is no system refused by name."""
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numba.core.errors import TypingError
 from numba.core.runtime import _nrt_python, rtsys
 
+from disco_hw.control.kernel import roll_block
 from disco_hw.control.kernel.step import disco_step, shift
 from disco_hw.control.pendulum import PAPER_SAMPLER, PendulumPlanner, PendulumPoints
 from disco_hw.jit import kernel_function
@@ -63,3 +66,21 @@ def test_the_step_allocates_nothing():
     # Both make the same records of the arrays that they are handed, and nothing else.
     of_step, of_nothing = allocations(planner.optimiser.arguments)
     assert of_step == of_nothing > 0
+
+
+class Nonsense(NamedTuple):
+    """Terms that no file has overloaded the rollout for."""
+
+    value: Any
+
+
+@kernel_function
+def rolled(system):
+    roll_block(system, None, 1, 80, 0, 10, None, None)
+
+
+def test_a_system_without_a_rollout_is_refused():
+    with pytest.raises(TypeError, match="Nonsense cannot be rolled out"):
+        roll_block(Nonsense(1.0), None, 1, 80, 0, 10, None, None)
+    with pytest.raises(TypingError, match="No implementation of function"):
+        rolled(Nonsense(1.0))

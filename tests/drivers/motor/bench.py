@@ -92,9 +92,21 @@ class Bench:
         self.run(seconds, command)
         return self
 
-    def inject_to_host(self, can_id, data):
+    def pause_host(self, seconds):
+        """Run for a time in which the host does nothing."""
+        self.host_runs = False
+        self.run(seconds)
+        self.host_runs = True
+
+    def run_unread(self, seconds):
+        """Run for a time in which the host does not read what comes; all of that waits for it afterwards."""
+        receive, self.host_end.receive = self.host_end.receive, lambda: ()
+        self.run(seconds)
+        self.host_end.receive = receive
+
+    def inject_to_host(self, can_id, data, extended=False):
         """A frame that somebody else sends; the driver sees it with its next batch."""
-        self.robot_end.send(OutgoingFrame(Frame(can_id, data), self.now_ns), self.now_ns)
+        self.robot_end.send(OutgoingFrame(Frame(can_id, data, extended), self.now_ns), self.now_ns)
 
     def inject_to_robot(self, can_id, data):
         self.robot.receive(self.now_ns, Frame(can_id, data))

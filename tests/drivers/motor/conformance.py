@@ -15,6 +15,32 @@ from tests.drivers.motor.bench import FORWARD, IDLE_STATES, Bench
 from tests.tables import thinned
 
 
+def check_that_wheels_follow(bench, speed_tolerance_rad_s, angle_tolerance_rad):
+    """Arm, which moves nothing, and command speeds, which the wheels take up and the samples report."""
+    bench.arm()
+    assert bench.largest_speed == 0.0, "arming alone moves nothing"
+    bench.run(1.0, FORWARD)
+    speeds = pytest.approx(FORWARD, abs=speed_tolerance_rad_s)
+    last = bench.wheels[-1]
+    assert bench.robot.speed == speeds
+    assert (last.left_speed_rad_s, last.right_speed_rad_s) == speeds
+    for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
+        moved = getattr(last, name) - getattr(bench.wheels[0], name)
+        behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9
+        assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=angle_tolerance_rad)
+
+
+def check_that_what_is_no_command_is_refused(bench):
+    bench.arm()
+    sent = bench.driver.stats.commands_sent
+    speeds = [WheelCommand(*bad, 0.1) for bad in ((math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf))]
+    durations = [WheelCommand(0.0, 0.0, valid_for_s) for valid_for_s in (math.nan, 0.0, -1.0)]
+    for command in speeds + durations:
+        with pytest.raises(ValueError, match="not a wheel command"):
+            bench.driver.transmit(bench.now_ns, command)
+        assert bench.driver.stats.commands_sent == sent, command
+
+
 class DriverConformance:
     """The suite; `watchdog_s` and `deceleration_rad_s2` are those of the controller."""
 
@@ -45,35 +71,22 @@ class DriverConformance:
         assert driver.identity is driver.limits is None
         assert driver.detail
 
-    def test_introduces_itself_and_stays_still(self, bench):
+    def test_introduces_itself_and_moves_nothing_before_it_is_armed(self, bench):
         bench.run_until(*IDLE_STATES)
         assert bench.driver.identity.controller
         assert bench.driver.limits.ticks_per_rev.value > 0
         assert bench.driver.limits.max_wheel_speed_rad_s.value > 0
         bench.run(1.0, FORWARD)
-        assert bench.largest_speed == 0.0
         assert not bench.robot.armed
-
-    def test_armed_the_wheels_follow_the_command_and_the_samples_say_so(self, bench):
-        bench.arm()
-        assert bench.robot.armed
-        assert bench.largest_speed == 0.0, "arming alone moves nothing"
-        bench.run(1.0, FORWARD)
-        assert bench.robot.speed == pytest.approx(FORWARD, abs=0.005)
-        last = bench.wheels[-1]
-        assert (last.left_speed_rad_s, last.right_speed_rad_s) == pytest.approx(FORWARD, abs=0.005)
-        resolution = 2 * math.pi / bench.driver.limits.ticks_per_rev.value
-        for wheel, name in enumerate(("left_angle_rad", "right_angle_rad")):
-            moved = getattr(last, name) - getattr(bench.wheels[0], name)
-            behind = bench.robot.speed[wheel] * (bench.now_ns - last.t_ns) * 1e-9
-            assert moved == pytest.approx(bench.robot.angle[wheel] - behind, abs=2 * resolution + 0.02)
-
-    def test_ready_opens_a_session_and_moves_nothing(self, bench):
-        bench.run_until(*IDLE_STATES)
         bench.request(Request.READY).run_until(DriverState.READY)
         bench.run(1.0, FORWARD)
         assert bench.driver.state is DriverState.READY
         assert bench.largest_speed == 0.0
+
+    def test_armed_the_wheels_follow_the_command_and_the_samples_say_so(self, bench):
+        bench.run_until(*IDLE_STATES)
+        check_that_wheels_follow(bench, 0.005, 4 * math.pi / bench.driver.limits.ticks_per_rev.value + 0.02)
+        assert bench.robot.armed
 
     def test_a_silent_host_stops_the_robot_and_is_not_armed_when_it_comes_back(self, bench):
         bench.drive(0.6, FORWARD)
@@ -225,17 +238,7 @@ class DriverConformance:
     estop_id = 0x080
 
     def test_a_command_that_is_none_is_the_callers_error(self, bench):
-        bench.arm()
-        sent = bench.driver.stats.commands_sent
-        for bad in [(math.nan, 0.0), (0.0, math.inf), (0.0, -math.inf)]:
-            self.assert_refused(bench, WheelCommand(*bad, 0.1))
-        for valid_for_s in (math.nan, 0.0, -1.0):
-            self.assert_refused(bench, WheelCommand(0.0, 0.0, valid_for_s))
-        assert bench.driver.stats.commands_sent == sent
-
-    def assert_refused(self, bench, command):
-        with pytest.raises(ValueError, match="not a wheel command"):
-            bench.driver.transmit(bench.now_ns, command)
+        check_that_what_is_no_command_is_refused(bench)
 
     def test_released_the_wheels_roll_out_without_a_ramp_and_the_reason_is_a_fault_until_a_reset(self, bench):
         bench.drive(0.6, FORWARD)

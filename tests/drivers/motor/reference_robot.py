@@ -1,11 +1,26 @@
 """The real C firmware core, with wheels that follow their setpoint at once in place of motors."""
 
+import itertools
 import math
 
+from drivers.motor.reference import ReferenceDriver
 from drivers.types import Frame
+from firmware_protocol.codec import Codec
 from firmware_protocol.firmware_core import FirmwareConfig, FirmwareCore, FirmwareInputs
+from tests.drivers.motor.bench import Bench
+
+CODEC = Codec()
 
 CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+
+
+def create_driver(key=None):
+    return ReferenceDriver(CODEC, itertools.count(41).__next__, key)
+
+
+def create_bench(robot=None, **options):
+    """Return a bench of the reference driver, with a robot of `CONFIG` unless it is given another."""
+    return Bench(create_driver(), robot or ReferenceRobot(), **options)
 
 
 class ReferenceRobot:

@@ -7,9 +7,9 @@ import pytest
 from drivers.types import DriverState, Request
 from sim.devices.agilex import CAN_MODE, STANDBY
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-(AGILEX,) = [vendor for vendor in VENDORS if vendor.name == "agilex"]
+AGILEX = BY_LABEL["agilex"]
 
 
 @pytest.fixture
@@ -17,26 +17,21 @@ def bench():
     return AGILEX.bench()
 
 
-def test_a_person_who_takes_the_remote_control_drives_and_that_is_no_fault(bench):
+def test_a_person_who_takes_the_remote_control_drives_and_after_that_it_does_not_drive_on(bench):
+    base = bench.robot.controller.base
     bench.drive(0.5, FORWARD)
-    bench.robot.controller.base.use_remote_control(0.3, 0.0)
+    base.use_remote_control(0.3, 0.0)
     bench.run(0.3, FORWARD)
-    assert bench.driver.state in IDLE_STATES
+    assert bench.driver.state in IDLE_STATES, "no fault"
     assert "remote control" in bench.driver.detail
     assert bench.robot.speed == pytest.approx((5.0, 5.0))
     bench.request(Request.ARM).run(1.0)
     assert bench.driver.state in IDLE_STATES
     assert bench.robot.speed == pytest.approx((5.0, 5.0)), "the person still drives"
-
-
-def test_after_the_person_has_let_go_it_does_not_drive_on(bench):
-    bench.drive(0.5, FORWARD)
-    bench.robot.controller.base.use_remote_control(0.3, 0.0)
-    bench.run(0.3, FORWARD)
-    bench.robot.controller.base.control_mode = CAN_MODE
+    base.control_mode = CAN_MODE
     bench.run(1.0, FORWARD)
     assert bench.robot.speed_rad_s == 0.0
-    assert bench.robot.controller.base.control_mode == STANDBY
+    assert base.control_mode == STANDBY
 
 
 def test_the_buttons_stop_it_and_need_a_reset(bench):
@@ -87,9 +82,7 @@ def test_more_than_the_base_can_do_is_scaled_and_keeps_its_curve(bench):
 @pytest.mark.parametrize("pause_s", [0.55, 2.0])
 def test_a_host_that_paused_for_longer_than_the_time_out_is_disarmed(bench, pause_s):
     bench.drive(0.5, FORWARD)
-    bench.host_runs = False
-    bench.run(pause_s)
-    bench.host_runs = True
+    bench.pause_host(pause_s)
     bench.run(0.3, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert bench.robot.speed_rad_s == 0.0

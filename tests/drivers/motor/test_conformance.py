@@ -1,19 +1,16 @@
 """The conformance suite for the reference driver, against the real C firmware core."""
 
-import itertools
 from dataclasses import replace
 
-from drivers.motor.reference import ReferenceDriver
-from firmware_protocol.codec import Codec
 from tests.drivers.motor.conformance import DriverConformance
-from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
+from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot, create_driver
 
 
 class TestReferenceDriver(DriverConformance):
     frame_ids = range(0x100, 0x162)
 
     def create_driver(self):
-        return ReferenceDriver(Codec(), itertools.count(41).__next__)
+        return create_driver()
 
     def create_robot(self, first_ticks=(0, 0)):
         return ReferenceRobot(first_ticks=first_ticks)
@@ -28,7 +25,7 @@ class TestAuthenticatedReferenceDriver(TestReferenceDriver):
     key = bytes(range(16))
 
     def create_driver(self):
-        return ReferenceDriver(Codec(), itertools.count(41).__next__, self.key)
+        return create_driver(self.key)
 
     def create_robot(self, first_ticks=(0, 0)):
         return ReferenceRobot(replace(CONFIG, key=self.key), first_ticks=first_ticks)

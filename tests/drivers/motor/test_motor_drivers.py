@@ -22,6 +22,8 @@ WOMBOT = ROOT / "disco_hw/robots/wombot.toml"
 
 
 ROBOCLAW = 'driver = "roboclaw"\nkind = "serial"\ncounts_per_rev = 8192.0\nwatchdog_s = 0.2\n'
+ODRIVE = 'driver = "odrive"\nvel_limit_turns_s = 10.0\n'
+VESC = f'driver = "vesc"\n{EXAMPLES["vesc"]}\n'
 
 
 def robot_toml(folder, link):
@@ -31,16 +33,18 @@ def robot_toml(folder, link):
     return file
 
 
-def test_every_driver_is_made_by_its_name_and_begins_without_a_link():
-    for name, driver in motor_drivers().items():
-        assert driver.name == name
-        settings = msgspec.convert(tomllib.loads(EXAMPLES[name]), driver.settings)
-        assert create_driver(name, settings).state is DriverState.DISCONNECTED
+@pytest.mark.parametrize("name", motor_drivers())
+def test_every_driver_is_found_and_made_by_its_name_and_robot_toml_may_name_it(tmp_path, name):
+    driver = motor_drivers()[name]
+    assert driver.name == name
+    assert find_driver(name) is driver
+    settings = msgspec.convert(tomllib.loads(EXAMPLES[name]), driver.settings)
+    assert create_driver(name, settings).state is DriverState.DISCONNECTED
+    link = f'driver = "{name}"\nkind = "{driver.kinds[0]}"\n{EXAMPLES[name]}'
+    assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
 
 
-def test_every_driver_is_found_by_its_name_and_none_without_one_is_the_default():
-    for name, driver in motor_drivers().items():
-        assert find_driver(name) is driver
+def test_without_a_name_the_driver_is_the_default():
     assert find_driver(None) is motor_drivers()[DEFAULT]
 
 
@@ -55,57 +59,29 @@ def test_what_needs_one_driver_reads_no_other():
     assert not {"drivers.motor.odrive", "drivers.motor.roboclaw", "drivers.motor.agilex"} & set(names)
 
 
-def test_a_module_beside_the_drivers_is_none():
-    with pytest.raises(UnknownDriverError, match='no driver "wiring"'):
-        find_driver("wiring")
-
-
-def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are():
-    with pytest.raises(UnknownDriverError, match=f'no driver "oddrive"; write one of {", ".join(motor_drivers())}$'):
-        create_driver("oddrive")
-
-
-def test_robot_toml_with_an_unknown_driver_is_refused_in_one_line(tmp_path):
-    with pytest.raises(InputError) as refused:
-        load_robot_config(robot_toml(tmp_path, 'driver = "oddrive"'))
-    assert "robot.toml: link.driver: there is no driver" in str(refused.value)
-    assert "\n" not in str(refused.value)
-
-
-def test_robot_toml_may_name_each_driver(tmp_path):
-    for name in motor_drivers():
-        link = f'driver = "{name}"\nkind = "{motor_drivers()[name].kinds[0]}"\n{EXAMPLES[name]}'
-        assert load_robot_config(robot_toml(tmp_path, link)).link.driver == name
+@pytest.mark.parametrize("name", ["oddrive", "wiring"], ids=["no module", "a module beside the drivers"])
+def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are(name):
+    with pytest.raises(UnknownDriverError, match=f'no driver "{name}"; write one of {", ".join(motor_drivers())}$'):
+        create_driver(name)
 
 
 @pytest.mark.parametrize(
     ("link", "expected_error"),
     [
+        ('driver = "oddrive"', r"robot\.toml: link\.driver: there is no driver"),
         ("nodes = [3, 5]", r"link\.nodes: belongs to the driver odrive, but link.driver is reference; remove it"),
-        ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0', r"watchdog_s: missing; add it"),
-        ('driver = "odrive"\nnodes = [3, 5]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.0', r"link\.watchdog_s"),
-        ('driver = "odrive"\nnodes = [3, 3]\nvel_limit_turns_s = 10.0\nwatchdog_s = 0.1', r"link\.nodes: .*twice"),
-        ('driver = "odrive"\nnodes = [3, 63]\nvel_limit_turns_s = 9.0\nwatchdog_s = 0.1', r"link\.nodes: .*0 to 62"),
+        (f"{ODRIVE}nodes = [3, 5]", r"watchdog_s: missing; add it"),
+        (f"{ODRIVE}nodes = [3, 5]\nwatchdog_s = 0.0", r"link\.watchdog_s"),
+        (f"{ODRIVE}nodes = [3, 3]\nwatchdog_s = 0.1", r"link\.nodes: .*twice"),
+        (f"{ODRIVE}nodes = [3, 63]\nwatchdog_s = 0.1", r"link\.nodes: .*0 to 62"),
         (f'{ROBOCLAW}motors = ["127/1", "128/2"]', r'link\.motors: "127/1" is no motor; write'),
         (f'{ROBOCLAW}motors = ["128/1", "128/1"]', r"link\.motors: a motor is listed twice"),
         (f'{ROBOCLAW}motors = ["128/1", []]', r"link\.motors: a side has no motor"),
-        (
-            f'{ROBOCLAW.replace("0.2", "0.25")}motors = ["128/1", "128/2"]',
-            r"watchdog_s: 0\.25 is not a multiple of 0\.1",
-        ),
-        (f'{ROBOCLAW.replace("serial", "can")}motors = ["128/1", "128/2"]', r'roboclaw does not .*; write "serial"'),
-        (
-            f'driver = "vesc"\nkind = "serial"\n{EXAMPLES["vesc"]}',
-            r"link\.uart_node: belongs to a serial line, .*add it",
-        ),
-        (
-            f'driver = "vesc"\n{EXAMPLES["vesc"]}uart_node = 23',
-            r"link\.uart_node: belongs to a serial line, .*remove it",
-        ),
-        (
-            f'driver = "vesc"\nkind = "serial"\n{EXAMPLES["vesc"]}uart_node = 9',
-            r"link\.uart_node: 9 is not in link\.nodes",
-        ),
+        (ROBOCLAW.replace("0.2", "0.25") + 'motors = ["128/1", "128/2"]', r"watchdog_s: 0\.25 is not a multiple"),
+        (ROBOCLAW.replace("serial", "can") + 'motors = ["128/1", "128/2"]', r'roboclaw does not .*; write "serial"'),
+        (f'{VESC}kind = "serial"', r"link\.uart_node: belongs to a serial line, .*add it"),
+        (f"{VESC}uart_node = 23", r"link\.uart_node: belongs to a serial line, .*remove it"),
+        (f'{VESC}kind = "serial"\nuart_node = 9', r"link\.uart_node: 9 is not in link\.nodes"),
         ("of_driver = 3", r"link\.of_driver: no such field"),
         ("gears = 3", r"gears: no such field"),
     ],

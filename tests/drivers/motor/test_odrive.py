@@ -8,9 +8,9 @@ import pytest
 from drivers.types import DriverState, Request
 from sim.devices.odrive import CLOSED_LOOP, IDLE
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-NEW, OLD = VENDORS[:2]
+NEW, OLD = BY_LABEL["odrive-0.6"], BY_LABEL["odrive-0.5"]
 
 
 @pytest.fixture(params=[NEW, OLD], ids=str)
@@ -66,8 +66,10 @@ def test_an_axis_that_idles_without_an_error_is_a_fault_that_stays(bench):
 def test_one_axis_whose_heartbeat_fails_to_come_stops_the_others(bench):
     bench.drive(0.5, FORWARD)
     silent_node = axes(bench)[1].node_id
-    drain = bench.robot.drain
-    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id != silent_node << 5 | 1]
+    drain, bench.robot.drain = (
+        bench.robot.drain,
+        lambda: [frame for frame in drain() if frame.can_id != silent_node << 5 | 1],
+    )
     bench.run(0.2, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert f"node {silent_node} stopped reporting" in bench.driver.detail
@@ -76,8 +78,7 @@ def test_one_axis_whose_heartbeat_fails_to_come_stops_the_others(bench):
 
 def test_a_missing_node_is_named():
     bench = NEW.bench()
-    drain = bench.robot.drain
-    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id >> 5 != 5]
+    drain, bench.robot.drain = bench.robot.drain, lambda: [frame for frame in drain() if frame.can_id >> 5 != 5]
     bench.run(2.0)
     assert bench.driver.state is DriverState.HANDSHAKE
     assert "node 5" in bench.driver.detail
@@ -143,8 +144,7 @@ def test_it_does_not_arm_while_an_axis_turns(bench):
 
 
 def test_it_does_not_arm_without_encoder_estimates(bench):
-    drain = bench.robot.drain
-    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id & 0x1F != 0x09]
+    drain, bench.robot.drain = bench.robot.drain, lambda: [frame for frame in drain() if frame.can_id & 0x1F != 0x09]
     bench.run_until(*IDLE_STATES)
     bench.request(Request.ARM).run(0.3)
     assert bench.driver.state in IDLE_STATES

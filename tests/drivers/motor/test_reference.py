@@ -1,27 +1,20 @@
 """Tests of what is particular to the reference driver; the rest is in the conformance suite."""
 
-import itertools
 from collections import Counter
 from dataclasses import replace
 
 import pytest
 
-from drivers.motor.reference import ESTOP_REPEATS, ReferenceDriver
-from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
-from firmware_protocol.codec import Codec
+from drivers.motor.reference import ESTOP_REPEATS
+from drivers.motor.reference_protocol import cyclic_frames
+from drivers.types import CyclicFrame, DriverState, Frame, NoSettings, ReceivedFrame, Request, WheelCommand
 from firmware_protocol.status_codes import FAULTS
-from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS, Bench
-from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
+from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS
+from tests.drivers.motor.reference_robot import CODEC, CONFIG, ReferenceRobot, create_bench, create_driver
 
-CODEC = Codec()
-
-
-def create_driver():
-    return ReferenceDriver(CODEC, itertools.count(3).__next__)
-
-
-def create_bench(robot=None, **options):
-    return Bench(create_driver(), robot or ReferenceRobot(), **options)
+SILENT = "the robot stopped sending: starting a new handshake; check the cable and the robot's power"
+TIME_REQUEST = CODEC.encode("TIME_REQUEST", 0, sequence=1)
+SECOND_HOST = "another host is on the link: it sends TIME_REQUEST; disconnect it"
 
 
 @pytest.fixture
@@ -55,7 +48,7 @@ def test_another_major_version_is_refused():
     assert bench.largest_speed == 0.0
 
 
-def test_another_dbc_is_refused_but_telemetry_is_shown():
+def test_another_dbc_is_refused_but_telemetry_is_shown_until_the_robot_is_flashed():
     bench = create_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
     bench.run_until(DriverState.REFUSED)
     assert "0badcafe" in bench.driver.detail
@@ -67,11 +60,6 @@ def test_another_dbc_is_refused_but_telemetry_is_shown():
     assert bench.largest_speed == 0.0
     assert len(bench.wheels) > 100
     assert any("handshake refused" in event for event in bench.events)
-
-
-def test_a_robot_flashed_meanwhile_is_taken():
-    bench = create_bench(ReferenceRobot(replace(CONFIG, dbc_hash=0x0BADCAFE)))
-    bench.run_until(DriverState.REFUSED)
     bench.robot = ReferenceRobot(boot_ns=bench.now_ns)
     bench.run_until(*IDLE_STATES, timeout_s=6.0)
 
@@ -130,20 +118,16 @@ def test_arming_is_given_up_with_the_robots_own_reason(bench):
 
 def test_a_second_host_is_pointed_out_once_a_link(bench):
     bench.run_until(*IDLE_STATES)
-    other = CODEC.encode("TIME_REQUEST", 0, sequence=1)
-    reported = "another host is on the link: it sends TIME_REQUEST; disconnect it"
-    for _ in range(3):
-        bench.inject_to_host(*other)
+    for link in (1, 2):
+        for _ in range(3):
+            bench.inject_to_host(*TIME_REQUEST)
+            bench.run(0.1)
+        assert bench.events.count(SECOND_HOST) == link
+        bench.host_end.plug(False)
         bench.run(0.1)
-    assert bench.events.count(reported) == 1
-    bench.host_end.plug(False)
-    bench.run(0.1)
-    bench.host_end.plug(True)
-    bench.run(0.5)
-    assert bench.events.count(reported) == 1
-    bench.inject_to_host(*other)
-    bench.run(0.1)
-    assert bench.events.count(reported) == 2
+        bench.host_end.plug(True)
+        bench.run(0.5)
+        assert bench.events.count(SECOND_HOST) == link
 
 
 def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it():
@@ -160,28 +144,24 @@ def test_a_second_host_that_commands_motion_stops_the_robot_but_never_drives_it(
     assert "another host is on the link: it sends WHEEL_COMMAND; disconnect it" in bench.events
 
 
-def test_an_estop_from_outside_is_no_second_host_and_is_said_once_a_stop(bench):
+def test_an_estop_from_outside_is_said_once_a_stop_and_is_no_second_host_unless_that_sends_more(bench):
     """As `disco-hw estop` sends it beside the daemon: three frames, which the robot and the driver both receive."""
+    estop = CODEC.encode("ESTOP", reason="UNSPECIFIED")
     bench.arm()
-    reported = "e-stop received on the link, sent by `disco-hw estop` or another host"
     for stops in (1, 2):
         for _ in range(3):
-            bench.inject_to_robot(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
-            bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
+            bench.inject_to_robot(*estop)
+            bench.inject_to_host(*estop)
             bench.run(0.02)
         bench.run(2.0)
-        assert bench.events.count(reported) == stops
+        assert bench.events.count("e-stop received on the link, sent by `disco-hw estop` or another host") == stops
     assert bench.driver.state is DriverState.ESTOP
     assert not any("another host is on the link" in event for event in bench.events)
     assert bench.driver.stats.unknown_id == 0
-
-
-def test_a_second_host_is_pointed_out_even_if_it_sends_an_estop_first(bench):
-    bench.run_until(*IDLE_STATES)
-    bench.inject_to_host(*CODEC.encode("ESTOP", reason="UNSPECIFIED"))
-    bench.inject_to_host(*CODEC.encode("TIME_REQUEST", 0, sequence=1))
+    bench.inject_to_host(*estop)
+    bench.inject_to_host(*TIME_REQUEST)
     bench.run(0.1)
-    assert "another host is on the link: it sends TIME_REQUEST; disconnect it" in bench.events
+    assert SECOND_HOST in bench.events
 
 
 def test_a_new_link_voids_everything_even_if_its_loss_went_unseen():
@@ -206,6 +186,15 @@ def received_frame(name, counter=0, **signals):
     return ReceivedFrame(START_NS, Frame(*CODEC.encode(name, counter, **signals)))
 
 
+def build():
+    return received_frame("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
+
+
+def state(counter):
+    names = ("state", "fault", "session", "estop_source", "last_command_counter", "rejected_count", "reject_reason")
+    return received_frame("SYSTEM_STATE", counter, **dict.fromkeys(names, 0) | {"state": 1, "stop_cause": 0})
+
+
 def limits(page):
     if page == 0:
         return received_frame("LIMITS", page=0, max_wheel_speed=8, max_wheel_acceleration=20, ticks_per_rev=2048)
@@ -213,15 +202,8 @@ def limits(page):
 
 
 def hello():
-    return received_frame(
-        "HELLO",
-        protocol_major=1,
-        protocol_minor=0,
-        firmware_major=0,
-        firmware_minor=1,
-        firmware_patch=0,
-        capabilities=0,
-    )
+    names = ("protocol_minor", "firmware_major", "firmware_minor", "firmware_patch", "capabilities")
+    return received_frame("HELLO", protocol_major=1, **dict.fromkeys(names, 0))
 
 
 def test_says_which_part_of_the_handshake_is_missing():
@@ -229,7 +211,7 @@ def test_says_which_part_of_the_handshake_is_missing():
     driver.link_up(START_NS)
     driver.receive(START_NS, [hello(), limits(0)])
     assert driver.detail == "waiting for the robot's BUILD, LIMITS"
-    driver.receive(START_NS, [received_frame("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1), limits(1)])
+    driver.receive(START_NS, [build(), limits(1)])
     assert driver.identity is not None
     assert driver.detail == "waiting for the robot's SYSTEM_STATE"
     later_ns = START_NS + 400 * MS
@@ -248,18 +230,10 @@ def test_a_response_to_a_request_of_the_last_link_teaches_nothing():
     assert driver.clock_offset_ns == START_NS - 5_000
 
 
-@pytest.mark.parametrize("call", ["receive", "transmit"])
-def test_silence_is_noticed_by_each_half_of_a_tick(call, bench):
+def test_silence_is_noticed_by_whoever_only_transmits(bench):
     bench.run_until(*IDLE_STATES)
-    driver, later_ns = bench.driver, bench.now_ns + 501 * MS
-    if call == "receive":
-        assert (
-            "the robot stopped sending: starting a new handshake; check the cable and the robot's power"
-            in driver.receive(later_ns, ()).events
-        )
-    else:
-        driver.transmit(later_ns, None)
-    assert driver.state is DriverState.HANDSHAKE
+    bench.driver.transmit(bench.now_ns + 501 * MS, None)
+    assert bench.driver.state is DriverState.HANDSHAKE
 
 
 def test_nothing_is_silent_that_was_never_heard(bench):
@@ -275,40 +249,23 @@ def test_a_silence_counts_only_beyond_its_limit_which_is_longer_for_a_robot_that
     """One that is refused says less, and should stay refused in words until it is gone."""
     bench = create_bench(ReferenceRobot(replace(CONFIG, **protocol)))
     bench.run_until(DriverState.REFUSED if protocol else DriverState.STANDBY)
-    received_ns = bench.driver._last_received_ns
-    assert bench.driver.receive(received_ns + silence_ms * MS, ()).events == ()
-    assert bench.driver.receive(received_ns + silence_ms * MS + 1, ()).events == (
-        "the robot stopped sending: starting a new handshake; check the cable and the robot's power",
-    )
+    limit_ns = bench.driver._last_received_ns + silence_ms * MS
+    assert bench.driver.receive(limit_ns, ()).events == ()
+    assert bench.driver.receive(limit_ns + 1, ()).events == (SILENT,)
     assert bench.driver.state is DriverState.HANDSHAKE
 
 
-def test_a_robot_that_has_shown_only_its_state_can_fall_silent_too():
-    driver, status = (
-        create_driver(),
-        {"state": 1, "fault": 0, "session": 0, "estop_source": 0, "last_command_counter": 0},
-    )
-    driver.link_up(START_NS)
-    for counter in range(4):
-        frame = CODEC.encode("SYSTEM_STATE", counter, **status, rejected_count=0, reject_reason=0, stop_cause=0)
-        now_ns = START_NS + counter * MS
-        driver.receive(now_ns, [ReceivedFrame(now_ns, Frame(*frame))])
-    assert driver.identity is driver.limits is None
-    assert driver.receive(START_NS + 504 * MS, ()).events == (
-        "the robot stopped sending: starting a new handshake; check the cable and the robot's power",
-    )
-
-
-def test_a_robot_that_has_shown_all_but_its_state_can_fall_silent_too():
+@pytest.mark.parametrize(
+    ("frames", "is_identified"),
+    [([state(counter) for counter in range(4)], False), ([hello(), limits(0), limits(1), build()], True)],
+    ids=["only its state", "all but its state"],
+)
+def test_a_robot_that_has_shown_only_a_part_can_fall_silent_too(frames, is_identified):
     driver = create_driver()
     driver.link_up(START_NS)
-    build = received_frame("BUILD", dbc_hash=CODEC.dbc_hash, board_id=1)
-    driver.receive(START_NS, [hello(), limits(0), limits(1), build])
-    assert driver.identity is not None
-    assert (
-        "the robot stopped sending: starting a new handshake; check the cable and the robot's power"
-        in driver.receive(START_NS + 501 * MS, ()).events
-    )
+    driver.receive(START_NS, frames)
+    assert (driver.identity is not None, driver.limits is not None) == (is_identified, is_identified)
+    assert driver.receive(START_NS + 501 * MS, ()).events == (SILENT,)
 
 
 def test_a_robot_that_turns_out_to_be_another_is_commanded_no_more():
@@ -366,24 +323,12 @@ def test_slow_telemetry_is_handed_on(bench):
     assert (status.state, status.fault, status.fault_code) == ("STANDBY", "NONE", 0)
 
 
-def test_commands_are_counted(bench):
-    bench.arm()
-    before = bench.driver.stats.commands_sent
-    bench.run(1.0, (1.0, 1.0))
-    assert bench.driver.stats.commands_sent - before == 50
-
-
 def names(frames):
     return [CODEC.decode(outgoing.frame.can_id, outgoing.frame.data).name for outgoing in frames]
 
 
-def test_house_keeping_is_sent_as_often_as_it_should():
-    driver, robot = create_driver(), ReferenceRobot()
-    counts = []
-    bench = Bench(driver, robot)
-    transmit = driver.transmit
-    sent = []
-    bench.driver = type("Spy", (), {"__getattr__": lambda _, name: getattr(driver, name)})()
+def test_house_keeping_is_sent_as_often_as_it_should(bench):
+    transmit, counts, sent = bench.driver.transmit, [], []
     bench.driver.transmit = lambda now_ns, command: sent.extend(frames := transmit(now_ns, command)) or frames
     for _ in range(4):
         sent.clear()
@@ -397,21 +342,20 @@ def test_house_keeping_is_sent_as_often_as_it_should():
     assert all(count["WHEEL_COMMAND"] == 0 for count in counts)
 
 
-def test_emergency_stop_frames():
-    driver = create_driver()
-    frames = driver.estop(1_000)
+def test_emergency_stop_frames(bench):
+    frames = bench.driver.estop(1_000)
     assert len(frames) == ESTOP_REPEATS == 3
     assert {outgoing.frame.can_id for outgoing in frames} == {0x080}
     assert all(outgoing.deadline_ns > 1_000 + 100 * MS for outgoing in frames)
 
 
-def test_a_command_leaves_in_time_or_not_at_all(bench):
+def test_commands_are_counted_and_leave_in_time_or_not_at_all(bench):
     bench.arm()
-    (command,) = (
-        outgoing
-        for outgoing in bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1))
-        if outgoing.frame.can_id == CODEC.can_id("WHEEL_COMMAND")
-    )
+    before = bench.driver.stats.commands_sent
+    bench.run(1.0, (1.0, 1.0))
+    assert bench.driver.stats.commands_sent - before == 50
+    frames = bench.driver.transmit(bench.now_ns, WheelCommand(1.0, 1.0, 0.1))
+    (command,) = (outgoing for outgoing in frames if outgoing.frame.can_id == CODEC.can_id("WHEEL_COMMAND"))
     assert command.deadline_ns == bench.now_ns + 50 * MS
     values = CODEC.decode(command.frame.can_id, command.frame.data).values
     assert values["valid_for"] == pytest.approx(0.1)
@@ -435,3 +379,12 @@ def test_released_its_motors_are_off_for_a_moment_then_braked_and_nothing_that_i
     assert all(braked[6:])
     assert not bench.robot.armed
     assert "disarmed: the left wheel does not count" in bench.events
+
+
+def test_the_protocols_cyclic_frames_are_those_of_the_dbc():
+    by_name = {frame.name: frame for frame in cyclic_frames(NoSettings(), 50.0, False)}
+    assert by_name["WHEEL_SPEED"] == CyclicFrame("WHEEL_SPEED", "ROBOT", 8, 100.0)
+    assert by_name["LIMITS"].rate_hz == 2.0
+    assert by_name["WHEEL_COMMAND"] == CyclicFrame("WHEEL_COMMAND", "HOST", 8, 50.0)
+    assert {frame.name: frame for frame in cyclic_frames(NoSettings(), 100.0, False)}["WHEEL_COMMAND"].rate_hz == 100.0
+    assert "ESTOP" not in by_name

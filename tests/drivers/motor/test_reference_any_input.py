@@ -1,17 +1,13 @@
 """The reference driver under whatever may come over the wire, and whatever its user asks of it."""
 
-import itertools
-
 from hypothesis import strategies as st
 
-from drivers.motor.reference import ReferenceDriver
 from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
 from firmware_protocol import protection
-from firmware_protocol.codec import PROTOCOL, Codec
+from firmware_protocol.codec import PROTOCOL
 from tests.drivers.motor.bench import MS, START_NS
+from tests.drivers.motor.reference_robot import CODEC, create_driver
 from tests.tables import examples
-
-CODEC = Codec()
 
 
 def protected(can_id, payload):
@@ -37,7 +33,7 @@ ACTION = st.one_of(
 
 @examples(quick=80, every=300, actions=st.lists(ACTION, max_size=60))
 def test_whatever_comes_nothing_is_raised_and_nothing_moves_unless_armed(actions):
-    driver = ReferenceDriver(CODEC, itertools.count(3).__next__)
+    driver = create_driver()
     now_ns = START_NS
     driver.link_up(now_ns)
     for action, value in actions:

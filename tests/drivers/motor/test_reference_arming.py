@@ -20,17 +20,19 @@ def report(arming, state, session=None, stop_cause="NONE", reject_reason="NONE")
     arming.handle_status(state, arming.session if session is None else session, stop_cause, reject_reason)
 
 
-def at_standby():
+def at_standby(request=None):
+    """An arming whose robot is in standby; with a request, one that has also begun on that."""
     one = arming()
     report(one, "STANDBY", 0)
+    if request is not None:
+        one.request(request)
+        one.step(0)
     return one
 
 
 def armed():
     """An arming that has gone all the way."""
-    one = at_standby()
-    one.request(Request.ARM)
-    one.step(0)
+    one = at_standby(Request.ARM)
     report(one, "READY")
     one.handle_session(0x1234, one.session, (), 0)
     report(one, "ARMED")
@@ -38,7 +40,7 @@ def armed():
     return one
 
 
-def test_the_way_up_step_by_step():
+def test_the_way_up_step_by_step_and_that_it_lasts():
     one = at_standby()
     assert one.host_state().request == "STANDBY"
     assert one.session == 0, "no session before one is wanted"
@@ -55,14 +57,13 @@ def test_the_way_up_step_by_step():
     assert one.needs_zeros
     assert not one.armed
     report(one, "ARMED")
+    one.step(100 * ARMING_TIMEOUT_NS)
     assert one.armed
     assert not one.needs_zeros
 
 
 def test_ready_alone_opens_a_session_and_asks_for_no_more():
-    one = at_standby()
-    one.request(Request.READY)
-    one.step(0)
+    one = at_standby(Request.READY)
     assert one.host_state().request == "READY"
     assert not one.ready
     report(one, "READY", one.session + 1)
@@ -88,23 +89,14 @@ def test_no_session_is_no_session_of_ours():
         assert not one.needs_zeros
 
 
-def test_armed_for_long_stays_armed():
-    one = armed()
-    one.step(100 * ARMING_TIMEOUT_NS)
-    assert one.armed
-
-
 def test_a_stopping_robot_that_still_shows_our_session_has_closed_it():
     one = armed()
-    spent = one.session
-    report(one, "STOPPING", spent)
+    report(one, "STOPPING", one.session)
     assert one.session == 0
 
 
 def test_a_challenge_of_another_session_is_not_answered():
-    one = at_standby()
-    one.request(Request.ARM)
-    one.step(0)
+    one = at_standby(Request.ARM)
     one.handle_session(0x1234, one.session + 1, (), 0)
     report(one, "READY")
     assert one.host_state().request == "READY"
@@ -156,9 +148,7 @@ def test_arm_is_consumed_when_the_link_or_robot_is_another_one():
 
 
 def test_no_session_before_the_robot_has_been_heard_again():
-    one = at_standby()
-    one.request(Request.READY)
-    one.step(0)
+    one = at_standby(Request.READY)
     report(one, "READY")
     one.reset("the link was lost")
     assert one.note == "", "nothing was taken away from anybody"
@@ -208,9 +198,7 @@ def test_arming_that_takes_too_long_is_given_up_with_the_robots_reason():
 
 
 def test_a_new_request_to_arm_has_all_the_time_again():
-    one = at_standby()
-    one.request(Request.ARM)
-    one.step(0)
+    one = at_standby(Request.ARM)
     one.request(Request.READY)
     one.request(Request.ARM)
     one.step(10 * ARMING_TIMEOUT_NS)
@@ -221,9 +209,11 @@ def test_a_new_request_to_arm_has_all_the_time_again():
 
 
 @pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
-def test_reset_is_held_until_the_robot_has_left_its_latch(state):
-    one = arming()
+def test_arm_is_consumed_by_a_latch_and_reset_is_held_until_the_robot_has_left_it(state):
+    one = at_standby()
+    one.request(Request.ARM)
     report(one, state, 0)
+    assert one.target is Request.STANDBY
     one.note = "not arming: the robot has a fault"
     one.request(Request.RESET)
     report(one, state, 0)
@@ -233,14 +223,6 @@ def test_reset_is_held_until_the_robot_has_left_its_latch(state):
     assert one.note == "", "what was said of the fault is over"
     report(one, state, 0)
     assert one.host_state().request == "STANDBY", "a later stop is not reset by an earlier request"
-
-
-@pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
-def test_arm_is_consumed_by_a_latch(state):
-    one = at_standby()
-    one.request(Request.ARM)
-    report(one, state, 0)
-    assert one.target is Request.STANDBY
 
 
 @given(st.lists(st.integers(0, 2**64), min_size=1, max_size=40), st.integers(0, 255))
@@ -277,9 +259,7 @@ def test_a_session_that_the_robot_has_had_before_is_replaced():
 
 
 def test_a_ready_session_serves_the_arming_that_follows():
-    one = at_standby()
-    one.request(Request.READY)
-    one.step(0)
+    one = at_standby(Request.READY)
     report(one, "READY")
     assert one.ready
     session = one.session
@@ -298,25 +278,32 @@ HELLO = {
     "firmware_patch": 7,
     "capabilities": 255 - 64,
 }
-BUILD = {"dbc_hash": 0xCAFE1234, "board_id": 9}
+BUILD = {"dbc_hash": HASH, "board_id": 9}
 PAGE0 = {"page": 0, "max_wheel_speed": 8.0, "max_wheel_acceleration": 20.0, "ticks_per_rev": 2048}
 PAGE1 = {"page": 1, "command_timeout": 0.1, "drive_off_timeout": 0.5, "stop_deceleration": 15.0}
 FRAMES = (("HELLO", HELLO), ("BUILD", BUILD), ("LIMITS", PAGE0), ("LIMITS", PAGE1))
 
 
-def handle_frames(handshake, *frames):
+def handshake_after(*frames, host=(1, 0, HASH), has_key=False):
+    """A handshake of a host with this protocol and DBC, after these frames of the robot."""
+    handshake = Handshake(*host, has_key=has_key)
     for name, values in frames:
         handshake.handle(Decoded(name, 0, 0, values))
     return handshake
 
 
+def changed_frames(frame, **values):
+    """The robot's frames, with other values in those of this name, or of this page of the limits."""
+    return [(name, {**had, **values} if frame in (name, had.get("page")) else had) for name, had in FRAMES]
+
+
 @pytest.mark.parametrize("frames", list(itertools.permutations(FRAMES)))
 def test_complete_with_the_last_frame_in_any_order(frames):
-    handshake = Handshake(1, 0, 0xCAFE1234)
-    for frame in frames:
+    for count in range(len(FRAMES)):
+        handshake = handshake_after(*frames[:count])
         assert handshake.identity is handshake.limits is None
         assert handshake.missing
-        handle_frames(handshake, frame)
+    handshake = handshake_after(*frames)
     assert handshake.missing == ()
     assert handshake.refusal is None
     identity, limits = handshake.identity, handshake.limits
@@ -329,29 +316,23 @@ def test_complete_with_the_last_frame_in_any_order(frames):
 
 
 def test_another_major_version_is_refused_at_the_first_frame():
-    handshake = handle_frames(Handshake(2, 5, 0xCAFE1234), ("HELLO", HELLO))
+    handshake = handshake_after(("HELLO", HELLO), host=(2, 5, HASH))
     assert "the robot speaks protocol 1.3, this host 2.5" in handshake.refusal
     assert "flash" in handshake.refusal
 
 
-def test_another_hash_may_be_read_but_is_refused():
-    handshake = handle_frames(Handshake(1, 0, 0x0000BEEF), *FRAMES)
+def test_another_hash_may_be_read_but_is_refused_until_the_robot_is_flashed():
+    frames = changed_frames("BUILD", dbc_hash=0xBEEF)
+    handshake = handshake_after(*frames)
     assert handshake.limits is not None
     for fragment in ("cafe1234", "0000beef", "can be read but not driven", "flash"):
         assert fragment in handshake.refusal
-
-
-def test_a_robot_flashed_meanwhile_is_accepted():
-    handshake = handle_frames(Handshake(1, 0, 0xBEEF), *FRAMES)
-    assert handshake.refusal
-    handle_frames(handshake, ("BUILD", {**BUILD, "dbc_hash": 0xBEEF}))
-    assert handshake.refusal is None
+    assert handshake_after(*frames, ("BUILD", BUILD)).refusal is None
 
 
 @pytest.mark.parametrize(("page", "name"), [(0, "ticks_per_rev"), (0, "max_wheel_speed"), (1, "command_timeout")])
 def test_limits_that_make_no_sense_are_refused(page, name):
-    broken = [(kind, {**values, name: 0} if values.get("page") == page else values) for kind, values in FRAMES]
-    handshake = handle_frames(Handshake(1, 0, 0xCAFE1234), *broken)
+    handshake = handshake_after(*changed_frames(page, **{name: 0}))
     assert handshake.identity is handshake.limits is None
     assert "that are not above zero" in handshake.refusal
 
@@ -361,8 +342,8 @@ def test_limits_that_make_no_sense_are_refused(page, name):
     [(False, 64, "accepts authenticated commands only"), (True, 63, "accepts commands without authentication")],
 )
 def test_a_key_on_one_end_alone_is_refused_in_words(has_key, bits, refusal):
-    frames = [(name, {**values, "capabilities": bits} if name == "HELLO" else values) for name, values in FRAMES]
-    handshake = handle_frames(Handshake(1, 0, 0xCAFE1234, has_key=has_key), *frames)
+    frames = changed_frames("HELLO", capabilities=bits)
+    handshake = handshake_after(*frames, has_key=has_key)
     assert refusal in handshake.refusal
     assert "link.key_file" in handshake.refusal
-    assert handle_frames(Handshake(1, 0, 0xCAFE1234, has_key=not has_key), *frames).refusal is None
+    assert handshake_after(*frames, has_key=not has_key).refusal is None

@@ -3,21 +3,19 @@ from hypothesis import strategies as st
 
 from drivers.motor.reference_frames import SLOW_TIMEOUT_NS, TIMEOUT_NS, FrameReception, FrameTransmission
 from drivers.types import Frame, ReceivedFrame
-from firmware_protocol.codec import PROTOCOL, Codec
+from firmware_protocol.codec import PROTOCOL
+from tests.drivers.motor.reference_robot import CODEC
 from tests.tables import examples
 
-CODEC = Codec()
 MS = 1_000_000
 
 
-def ticks(counter, t_ns=0):
-    encoded = CODEC.encode("WHEEL_TICKS", counter, left_ticks=1, right_ticks=2)
-    return ReceivedFrame(t_ns, Frame(encoded.can_id, encoded.data))
-
-
 def received(name, counter=0, t_ns=0, **signals):
-    encoded = CODEC.encode(name, counter, **signals)
-    return ReceivedFrame(t_ns, Frame(encoded.can_id, encoded.data))
+    return ReceivedFrame(t_ns, Frame(*CODEC.encode(name, counter, **signals)))
+
+
+def ticks(counter, t_ns=0):
+    return received("WHEEL_TICKS", counter, t_ns, left_ticks=1, right_ticks=2)
 
 
 def qualified():
@@ -27,18 +25,16 @@ def qualified():
     return reception
 
 
+@pytest.fixture
+def transmission():
+    return FrameTransmission(CODEC)
+
+
 def test_a_sender_is_believed_after_three_good_frames_in_a_row():
     reception = FrameReception(CODEC)
     believed = [reception.accept(ticks(counter)) is not None for counter in range(5)]
     assert believed == [False, False, False, True, True]
     assert reception.accepted == 2
-
-
-def test_the_same_number_with_29_bits_is_somebody_elses():
-    reception = qualified()
-    frame = ticks(4).frame
-    assert reception.accept(ReceivedFrame(0, Frame(frame.can_id, frame.data, extended=True))) is None
-    assert (reception.unknown_id, reception.accepted) == (1, 1)
 
 
 def test_answers_are_believed_at_once_whatever_their_counter():
@@ -82,12 +78,12 @@ def test_a_damaged_frame_is_counted_and_many_cost_the_trust():
     assert [reception.accept(ticks(counter)) is not None for counter in range(4, 8)] == [False, False, True, True]
 
 
-def test_wrong_length_unknown_page_and_unknown_identifier():
-    reception = FrameReception(CODEC)
-    reception.accept(ReceivedFrame(0, Frame(CODEC.can_id("WHEEL_TICKS"), bytes(7))))
-    reception.accept(ReceivedFrame(0, Frame(0x7FF, bytes(8))))
-    assert reception.rejected_length == 1
-    assert reception.unknown_id == 1
+def test_another_length_or_identifier_or_29_bits_are_counted():
+    reception = qualified()
+    can_id, data = ticks(4).frame.can_id, ticks(4).frame.data
+    for frame in (Frame(can_id, data[:7]), Frame(0x7FF, bytes(8)), Frame(can_id, data, extended=True)):
+        assert reception.accept(ReceivedFrame(0, frame)) is None
+    assert (reception.rejected_length, reception.unknown_id, reception.accepted) == (1, 2, 1)
 
 
 def test_what_only_a_host_sends_betrays_another_host():
@@ -149,29 +145,24 @@ def test_nothing_that_arrives_makes_it_raise_and_everything_is_counted(frames):
 COMMAND = {"mode": "SPEED", "left_speed": 1.0, "right_speed": -1.0, "valid_for": 0.1, "session": 5}
 
 
-def test_counters_count_per_message_and_wrap():
-    codec = Codec()
-    transmission = FrameTransmission(codec)
+def test_counters_count_per_message_and_wrap(transmission):
     counters = []
     for number in range(18):
         frame = transmission.frame("WHEEL_COMMAND", number, 7, **COMMAND)
         assert frame.deadline_ns == number + 7
-        counters.append(codec.decode(frame.frame.can_id, frame.frame.data).counter)
+        counters.append(CODEC.decode(frame.frame.can_id, frame.frame.data).counter)
         transmission.frame("TIME_REQUEST", number, 7, sequence=0)
     assert counters == [number % 16 for number in range(18)]
 
 
-def test_a_frame_that_could_not_be_made_uses_no_counter():
-    codec = Codec()
-    transmission = FrameTransmission(codec)
+def test_a_frame_that_could_not_be_made_uses_no_counter(transmission):
     with pytest.raises(ValueError, match="left_speed"):
         transmission.frame("WHEEL_COMMAND", 0, 7, **{**COMMAND, "left_speed": 100.0})
     frame = transmission.frame("WHEEL_COMMAND", 0, 7, **COMMAND)
-    assert codec.decode(frame.frame.can_id, frame.frame.data).counter == 0
+    assert CODEC.decode(frame.frame.can_id, frame.frame.data).counter == 0
 
 
-def test_due_after_a_period_or_when_forgotten():
-    transmission = FrameTransmission(Codec())
+def test_due_after_a_period_or_when_forgotten(transmission):
     assert transmission.due("TIME_REQUEST", 100, 50)
     transmission.frame("TIME_REQUEST", 100, 7, sequence=0)
     assert not transmission.due("TIME_REQUEST", 149, 50)
@@ -185,11 +176,9 @@ def outgoing_ids(frames):
 
 
 def test_with_a_key_a_proof_goes_before_each_frame_that_needs_one_with_the_same_deadline():
-    transmission = FrameTransmission(Codec(), bytes(16))
-    frames = [
-        transmission.frame("WHEEL_COMMAND", 0, 7, **COMMAND),
-        transmission.frame("TIME_REQUEST", 0, 9, sequence=0),
-    ]
+    transmission = FrameTransmission(CODEC, bytes(16))
+    command = transmission.frame("WHEEL_COMMAND", 0, 7, **COMMAND)
+    frames = [command, transmission.frame("TIME_REQUEST", 0, 9, sequence=0)]
     assert outgoing_ids(transmission.proved(frames)) == [0x150], "nothing unproved before the robot's nonce is known"
     transmission.challenge(5)
     proved = transmission.proved(frames)
@@ -199,8 +188,7 @@ def test_with_a_key_a_proof_goes_before_each_frame_that_needs_one_with_the_same_
     assert outgoing_ids(transmission.proved(frames)) == [0x150]
 
 
-def test_without_a_key_frames_stay_as_they_are():
-    transmission = FrameTransmission(Codec())
+def test_without_a_key_frames_stay_as_they_are(transmission):
     frames = (transmission.frame("WHEEL_COMMAND", 0, 7, **COMMAND),)
     transmission.challenge(5)
     assert transmission.proved(frames) == frames

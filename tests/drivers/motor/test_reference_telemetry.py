@@ -23,6 +23,7 @@ from tests.tables import examples, thinned
 MS = 1_000_000
 BOOT_NS = 777 * MS
 TICKS_PER_REV, MAX_SPEED_RAD_S = 2048, 8.0
+PER_TICK = 2 * math.pi / TICKS_PER_REV
 
 
 def synced_clock(now_ns):
@@ -78,22 +79,17 @@ def test_a_sample_is_stamped_with_its_measurement_whatever_its_delay(now_ms, age
     assert measured.t_ns == pytest.approx(now_ns - age_ms * MS, abs=105_000)
 
 
-def test_before_the_clock_is_known_the_reception_counts():
+def test_the_reception_counts_before_the_clock_is_known_and_for_a_sample_of_the_future():
     assert wheels(create_telemetry(), 0, 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
     assert pose(create_telemetry(), 9_000 * MS, 9_100 * MS).t_ns == 9_100 * MS
-
-
-def test_no_sample_is_of_the_future():
-    now_ns = 9_000 * MS
-    assert wheels(create_telemetry(now_ns), 0, now_ns + 5 * MS, now_ns).t_ns == now_ns
+    assert wheels(create_telemetry(9_000 * MS), 0, 9_005 * MS, 9_000 * MS).t_ns == 9_000 * MS
 
 
 def test_stamps_that_contradict_the_clock_are_counted_and_end_the_trust_in_it():
-    now_ns = 9_000 * MS
-    made = create_telemetry(now_ns)
+    made = create_telemetry(9_000 * MS)
     for counter in range(DISTRUST_CLOCK_AFTER):
         assert not made.distrusts_clock
-        t_ns = now_ns + counter * 10 * MS
+        t_ns = (9_000 + 10 * counter) * MS
         assert wheels(made, counter % 16, t_ns - 700 * MS, t_ns).t_ns == t_ns
     assert made.distrusts_clock
     assert made.implausible_values == DISTRUST_CLOCK_AFTER
@@ -101,18 +97,29 @@ def test_stamps_that_contradict_the_clock_are_counted_and_end_the_trust_in_it():
     assert not made.distrusts_clock
 
 
+def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
+    made = create_telemetry(9_000 * MS)
+    for number in range(3 * DISTRUST_CLOCK_AFTER):
+        t_ns = (9_000 + 10 * number) * MS
+        wheels(made, number % 16, t_ns - (700 * MS if number % 5 else 0), t_ns)
+    assert not made.distrusts_clock
+
+
 def test_angles_and_speeds(made):
     wheels(made, 0, 9_000 * MS, 9_000 * MS, ticks=(2**24 - 3, 5))
     sample = wheels(made, 1, 9_010 * MS, 9_010 * MS, ticks=(2**24 + 7, -5))
-    per_tick = 2 * math.pi / 2048
-    assert (sample.left_angle_rad, sample.right_angle_rad) == pytest.approx((10 * per_tick, -10 * per_tick))
+    assert (sample.left_angle_rad, sample.right_angle_rad) == pytest.approx((10 * PER_TICK, -10 * PER_TICK))
     assert (sample.left_speed_rad_s, sample.right_speed_rad_s) == (1.0, -2.0)
+
+
+def ticks_of(speed_rad_s, elapsed_ms):
+    return int(speed_rad_s * elapsed_ms * 1e-3 / PER_TICK)
 
 
 def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length(made):
     """2.9 s at 8 rad/s; by the sample times alone it could have been 0.28 s."""
     wheels(made, 0, 9_000 * MS, 9_000 * MS)
-    moved = int(8.0 * 2.9 / (2 * math.pi) * 2048)
+    moved = ticks_of(8.0, 2_900)
     assert wheels(made, 1, 11_900 * MS, 11_900 * MS, ticks=(moved, moved)) is not None
     assert made.implausible_ticks == 0
 
@@ -120,9 +127,8 @@ def test_a_gap_longer_than_the_sample_times_wrap_allows_the_motion_of_its_length
 def test_receptions_in_a_batch_do_not_make_motion_implausible(made):
     """A loop that was held up reads five samples at once; their own times say how far apart they are."""
     for counter in range(5):
-        step = int(8.0 * 0.01 / (2 * math.pi) * 2048)
-        sample = wheels(made, counter, (9_000 + 10 * counter) * MS, 9_050 * MS, ticks=(counter * step, 0))
-        assert sample is not None
+        ticks = (counter * ticks_of(8.0, 10), 0)
+        assert wheels(made, counter, (9_000 + 10 * counter) * MS, 9_050 * MS, ticks=ticks) is not None
 
 
 @pytest.mark.parametrize("restarted_after_ms", range(30, 1300, 90))
@@ -148,12 +154,7 @@ def test_implausible_ticks_and_invalid_halves_are_counted_and_dropped(made):
 
 
 def test_nothing_is_known_of_angles_before_the_handshake():
-    made = Telemetry(DeviceClock())
-    assert wheels(made, 0, 9_000 * MS, 9_000 * MS) is None
-
-
-def ticks_of(speed_rad_s, elapsed_ms):
-    return int(speed_rad_s * elapsed_ms * 1e-3 / (2 * math.pi) * TICKS_PER_REV)
+    assert wheels(Telemetry(DeviceClock()), 0, 9_000 * MS, 9_000 * MS) is None
 
 
 @examples(
@@ -174,15 +175,6 @@ def test_motion_at_full_speed_is_plausible_over_any_gap_and_twice_that_is_not(st
         assert wheels(made, counter % 16, t_ms * MS, received_ns, ticks=(too_far, ticks)) is None
         ticks += ticks_of(8.0, gap_ms)
         assert wheels(made, (counter + 8) % 16, t_ms * MS, received_ns, ticks=(ticks, ticks)) is not None
-
-
-def test_a_stamp_that_fits_again_restores_the_trust_in_the_clock():
-    now_ns = 9_000 * MS
-    made = create_telemetry(now_ns)
-    for number in range(3 * DISTRUST_CLOCK_AFTER):
-        t_ns = now_ns + number * 10 * MS
-        wheels(made, number % 16, t_ns - (700 * MS if number % 5 else 0), t_ns)
-    assert not made.distrusts_clock
 
 
 @pytest.mark.parametrize(("restarts", "limits"), [(True, (TICKS_PER_REV, MAX_SPEED_RAD_S)), (False, (1024, 4.0))])
@@ -222,29 +214,21 @@ def test_slow_telemetry():
     assert (health.t_ns, health.tx_error_count, health.watchdog_count) == (7, 0, 5)
 
 
-def frame(name, counter):
-    return Decoded(name, 0, counter, {})
+A1, B1, A2, B2 = (Decoded(name, 0, counter, {}) for counter in (1, 2) for name in "AB")
 
 
-A1, B1, A2, B2 = frame("A", 1), frame("B", 1), frame("A", 2), frame("B", 2)
+def pairs_in(*frames):
+    """Return the pair, or None, that each of these frames completes."""
+    pairs = FramePairs("A")
+    return [pairs.add(frame, number) for number, frame in enumerate(frames)]
 
 
 def test_pairs_by_counter_in_either_order():
-    pairs = FramePairs("A")
-    assert pairs.add(A1, 0) is None
-    assert pairs.add(B1, 1) == (A1, B1)
-    assert pairs.add(B2, 2) is None
-    assert pairs.add(A2, 3) == (A2, B2)
+    assert pairs_in(A1, B1, B2, A2) == [None, (A1, B1), None, (A2, B2)]
 
 
 def test_a_lost_half_costs_its_own_sample_only():
-    pairs = FramePairs("A")
-    assert pairs.add(A1, 0) is None
-    assert pairs.add(A2, 1) is None
-    assert pairs.add(B2, 2) == (A2, B2)
-    assert pairs.add(B1, 3) is None
-    assert pairs.add(A2, 4) is None
-    assert pairs.add(B2, 5) == (A2, B2)
+    assert pairs_in(A1, A2, B2, B1, A2, B2) == [None, None, (A2, B2), None, None, (A2, B2)]
 
 
 def test_the_same_counter_a_lap_later_is_another_sample():
@@ -255,14 +239,15 @@ def test_the_same_counter_a_lap_later_is_another_sample():
 
 
 TICKS_PER_REV = 2048
-PER_TICK = 2 * math.pi / TICKS_PER_REV
 PERIOD_US = 10_000
-MAX_SPEED = 8.0
-LIMIT = int(SPEED_MARGIN * MAX_SPEED * PERIOD_US * 1e-6 / PER_TICK + SLACK_TICKS)
+LIMIT = int(SPEED_MARGIN * MAX_SPEED_RAD_S * PERIOD_US * 1e-6 / PER_TICK + SLACK_TICKS)
 
 
-def wheel_ticks():
-    return WheelTicks(TICKS_PER_REV, MAX_SPEED)
+def wheel_ticks(left=0, right=0):
+    """Return the ticks of two wheels, of which the counters were read once."""
+    ticks = WheelTicks(TICKS_PER_REV, MAX_SPEED_RAD_S)
+    ticks.update(left, right, 0)
+    return ticks
 
 
 @examples(
@@ -272,9 +257,8 @@ def wheel_ticks():
     steps=st.lists(st.tuples(st.integers(-LIMIT, LIMIT), st.integers(-LIMIT, LIMIT)), max_size=60),
 )
 def test_plausible_steps_add_up_wherever_the_ring_is_and_whichever_way_it_turns(start, steps):
-    ticks = wheel_ticks()
+    ticks = wheel_ticks(*start)
     left, right = start
-    ticks.update(left, right, 0)
     for number, (step_left, step_right) in enumerate(steps, 1):
         left, right = left + step_left, right + step_right
         angles = ticks.update(left % TICKS_MODULUS, right % TICKS_MODULUS, number * PERIOD_US)
@@ -285,7 +269,7 @@ def test_plausible_steps_add_up_wherever_the_ring_is_and_whichever_way_it_turns(
 def test_once_round_the_whole_ring(step, periods):
     ticks = wheel_ticks()
     count = TICKS_MODULUS // abs(step) + 10
-    for number in range(count + 1):
+    for number in range(1, count + 1):
         angles = ticks.update(number * step % TICKS_MODULUS, 0, number * periods * PERIOD_US)
     assert angles == (count * step * PER_TICK, 0.0)
 
@@ -298,8 +282,7 @@ def test_once_round_the_whole_ring(step, periods):
     wheel=st.sampled_from([0, 1]),
 )
 def test_a_jump_is_dropped_and_leaves_no_trace(jump, start, wheel):
-    ticks = wheel_ticks()
-    ticks.update(start, start, 0)
+    ticks = wheel_ticks(start, start)
     reading = [start, start]
     reading[wheel] = (start + jump) % TICKS_MODULUS
     assert ticks.update(*reading, PERIOD_US) is None
@@ -308,8 +291,7 @@ def test_a_jump_is_dropped_and_leaves_no_trace(jump, start, wheel):
 
 
 def test_counters_that_stay_elsewhere_are_believed_after_a_while_without_motion():
-    ticks = wheel_ticks()
-    ticks.update(100, 100, 0)
+    ticks = wheel_ticks(100, 100)
     ticks.update(110, 90, PERIOD_US)
     for number in range(2, REANCHOR_AFTER + 1):
         assert ticks.update(5_000_000 + number, 0, number * PERIOD_US) is None
@@ -319,7 +301,6 @@ def test_counters_that_stay_elsewhere_are_believed_after_a_while_without_motion(
 
 def test_only_readings_in_a_row_make_the_counters_believed():
     ticks = wheel_ticks()
-    ticks.update(0, 0, 0)
     for number in range(1, 20):
         odd = number % REANCHOR_AFTER
         angles = ticks.update(8_000_000 if odd else 0, 0, number * PERIOD_US)
@@ -328,19 +309,14 @@ def test_only_readings_in_a_row_make_the_counters_believed():
 
 def test_more_time_since_the_last_good_reading_allows_more_motion():
     ticks = wheel_ticks()
-    ticks.update(0, 0, 0)
     assert ticks.update(3 * LIMIT, 0, PERIOD_US) is None
     assert ticks.update(3 * LIMIT, 0, 4 * PERIOD_US) == (3 * LIMIT * PER_TICK, 0.0)
 
 
-def test_after_forgetting_the_angles_go_on_from_where_they_are():
-    ticks = wheel_ticks()
-    ticks.update(0, 0, 0)
-    ticks.update(20, 10, PERIOD_US)
-    ticks.clear()
-    assert ticks.update(9_000_000, 77, 2 * PERIOD_US) == (20 * PER_TICK, 10 * PER_TICK)
-
-
-def test_a_start_is_added():
-    ticks = WheelTicks(TICKS_PER_REV, MAX_SPEED, start=(3.0, -4.0))
+def test_the_angles_go_on_from_a_start_and_after_forgetting_from_where_they_are():
+    ticks = WheelTicks(TICKS_PER_REV, MAX_SPEED_RAD_S, start=(3.0, -4.0))
     assert ticks.update(7, 7, 0) == ticks.angles == (3.0, -4.0)
+    moved = pytest.approx((3.0 + 20 * PER_TICK, -4.0 + 10 * PER_TICK))
+    assert ticks.update(27, 17, PERIOD_US) == moved
+    ticks.clear()
+    assert ticks.update(9_000_000, 77, 2 * PERIOD_US) == moved

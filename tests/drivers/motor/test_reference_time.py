@@ -1,20 +1,11 @@
 """Time stamps of the reference driver, and robots whose clock or encoder starts anew."""
 
-import itertools
-
 import pytest
 
-from drivers.motor.reference import ReferenceDriver
 from drivers.types import DriverState, WheelCommand
-from firmware_protocol.codec import Codec
-from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS, Bench
-from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
+from tests.drivers.motor.bench import IDLE_STATES, MS, START_NS
+from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot, create_bench
 from tests.tables import thinned
-
-
-def create_bench(robot=None, **options):
-    driver = ReferenceDriver(Codec(), itertools.count(3).__next__)
-    return Bench(driver, robot or ReferenceRobot(), **options)
 
 
 @thinned("jitter_ms", [3.0, 0.0], quick=1)

@@ -7,9 +7,9 @@ from disco_hw.runtime.preflight import Level, check_link_load
 from drivers.motor.roboclaw_protocol import SETTERS
 from drivers.types import DriverState, Request, WheelCommand
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-ONE, TWO = (vendor for vendor in VENDORS if vendor.name == "roboclaw")
+ONE, TWO = BY_LABEL["roboclaw"], BY_LABEL["roboclaw-a-board-a-side"]
 STOP = SETTERS["duty_m1m2"].command
 
 

@@ -6,9 +6,9 @@ from drivers.motor import find_driver
 from drivers.motor import ros2_base_wire as wire
 from drivers.types import DriverState, Request, WheelCommand
 from tests.drivers.motor.bench import FORWARD
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-(VENDOR,) = [vendor for vendor in VENDORS if vendor.name == "ros2_base"]
+VENDOR = BY_LABEL["ros2-base"]
 
 
 @pytest.fixture
@@ -23,37 +23,36 @@ def end(bench):
     return bench.robot.controller.end
 
 
-def test_wheel_speeds_become_those_of_the_body_by_the_nominal_geometry(bench):
+@pytest.mark.parametrize(
+    ("left", "right", "by_radius"),
+    [(10.0, 20.0, (15.0, 10.0)), (25.0, 50.0, (18.75, 12.5))],
+    ids=["as asked", "more than the base can, slowed down on the same curve"],
+)
+def test_wheel_speeds_become_those_of_the_body_by_the_nominal_geometry(bench, left, right, by_radius):
     bench.arm()
-    (sent,) = bench.driver.transmit(bench.now_ns, WheelCommand(10.0, 20.0, 0.1))
-    assert sent.frame == wire.speeds(0.06 * 15.0, 0.06 * 10.0 / 0.31)
-
-
-def test_what_the_base_cannot_do_is_slowed_down_on_the_same_curve(bench):
-    bench.arm()
-    (sent,) = bench.driver.transmit(bench.now_ns, WheelCommand(25.0, 50.0, 0.1))
-    assert sent.frame == wire.speeds(0.06 * 18.75, 0.06 * 12.5 / 0.31)
+    (sent,) = bench.driver.transmit(bench.now_ns, WheelCommand(left, right, 0.1))
+    assert sent.frame == wire.speeds(0.06 * by_radius[0], 0.06 * by_radius[1] / 0.31)
 
 
 @pytest.mark.parametrize(
-    ("fault", "expected_detail", "state"),
+    ("flag", "wrong", "expected_detail", "state"),
     [
-        ("others_speak", "another node publishes on /cmd_vel", DriverState.STANDBY),
-        ("has_listener", "no node subscribes to /cmd_vel", DriverState.HANDSHAKE),
+        ("others_speak", True, "another node publishes on /cmd_vel", DriverState.STANDBY),
+        ("has_listener", False, "no node subscribes to /cmd_vel", DriverState.HANDSHAKE),
     ],
 )
 def test_a_base_that_others_drive_or_that_hears_nobody_is_not_armed_and_disarmed(
-    bench, end, fault, expected_detail, state
+    bench, end, flag, wrong, expected_detail, state
 ):
-    setattr(end, fault, fault == "others_speak")
+    setattr(end, flag, wrong)
     bench.run(0.2)
     bench.driver.request(Request.ARM)
     assert bench.driver.state is state
     assert expected_detail in bench.driver.detail
-    setattr(end, fault, fault != "others_speak")
+    setattr(end, flag, not wrong)
     bench.run(0.2)
     bench.drive(0.5, FORWARD)
-    setattr(end, fault, fault == "others_speak")
+    setattr(end, flag, wrong)
     bench.run(0.2)
     assert bench.driver.state is DriverState.FAULT
     assert expected_detail in bench.driver.detail

@@ -11,10 +11,9 @@ import pytest
 from drivers.types import DriverState, Request
 from sim.can_protocol import CanFrame
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL, VENDORS
 
 COASTING_S = 1.0
-PHASES = ("start", "arm", "run", "stop", "again", "fault", "reset", "reconnect", "estop", "after")
 SUMS = {
     "odrive-0.6": "73f18e 13b82a e58728 60e036 e0b0ee 0fbfb3 1a72f2 ed1764 9c195a 6324af",
     "odrive-0.5": "f8fb0e 7a818c 4742e8 86d68f 14437b 808aa8 8e5c8c 8afb1f 6edc79 00101a",
@@ -27,29 +26,29 @@ SUMS = {
     "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a bd0254 e0ba41 d2280f f93b2b 0cbba8 be8730 92b359",
     "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 255f60 81ad5e e3b0c4 186d20 3f0143 272f2d",
 }
-"""SHA-256 of each phase's frames, its first six digits."""
+"""SHA-256 of the frames of each phase of `scripted_day`, in its order: the first six digits."""
 
 
 class Recorded:
     """A bench whose driver's frames are kept by phase, whichever way they are asked for."""
 
     def __init__(self, vendor):
-        self.phases = []
+        self.phases = {}
         self.bench = vendor.bench(coasting_s=0.2)
         driver = self.bench.driver
         transmit, estop = driver.transmit, driver.estop
         driver.transmit = lambda now_ns, command: self.keep(now_ns, transmit(now_ns, command))
         driver.estop = lambda now_ns: self.keep(now_ns, estop(now_ns))
 
-    def begin(self):
-        self.phases.append([])
+    def begin(self, phase):
+        self.lines = self.phases[phase] = []
 
     def keep(self, now_ns, sent):
         for each in sent:
             frame = each.frame
             at_us, life_us = now_ns // 1000, (each.deadline_ns - now_ns) // 1000
             kind = "x" if frame.extended else "s"
-            self.phases[-1].append(f"{at_us} {life_us} {each.rank} {frame.can_id:x}{kind} {frame.data.hex()}")
+            self.lines.append(f"{at_us} {life_us} {each.rank} {frame.can_id:x}{kind} {frame.data.hex()}")
         return sent
 
 
@@ -63,45 +62,41 @@ def scripted_day(vendor):
     """The frames of each phase, as lines."""
     recorded = Recorded(vendor)
     bench, begin = recorded.bench, recorded.begin
-    begin()  # start
+    begin("start")
     bench.run_until(*IDLE_STATES)
     bench.run(0.5)
-    begin()  # arm
+    begin("arm")
     bench.arm()
-    begin()  # run
+    begin("run")
     bench.run(1.0, FORWARD)
     bench.run(0.5, (-1.0, 2.5))
-    begin()  # stop
+    begin("stop")
     bench.request(Request.STANDBY).run_until(*IDLE_STATES)
     bench.run(COASTING_S)
-    begin()  # again
+    begin("again")
     bench.drive(0.5, FORWARD)
-    begin()  # fault
+    begin("fault")
     vendor.lose_left(bench.robot)
     bench.run_until(DriverState.FAULT, timeout_s=0.5)
     bench.run(COASTING_S)
-    begin()  # reset
+    begin("reset")
     vendor.mend(bench.robot)
     bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(COASTING_S)
-    begin()  # reconnect
+    begin("reconnect")
     bench.drive(0.5, FORWARD)
     bench.host_end.plug(False)
     bench.run(COASTING_S)
     bench.host_end.plug(True)
     bench.run(COASTING_S)
-    begin()  # estop
+    begin("estop")
     bench.drive(0.5, FORWARD)
     bench.send_estop()
     bench.run(COASTING_S)
-    begin()  # after
+    begin("after")
     bench.request(Request.RESET).run_until(*IDLE_STATES)
     bench.run(0.5)
     return recorded.phases
-
-
-def sums(vendor):
-    return [hashlib.sha256("\n".join(lines).encode()).hexdigest()[:6] for lines in scripted_day(vendor)]
 
 
 UNUSED_COMMANDS = (20, 22, 28, 29, 61, 62, 94, 98, 148, 201)
@@ -114,7 +109,7 @@ def as_frame(frame):
 
 @pytest.mark.parametrize("vendor", MARKED_VENDORS, ids=str)
 def test_no_frame_of_a_scripted_day_moves_by_itself_calibrates_or_writes_what_stays(vendor):
-    sent = [as_frame(line.split(" ")) for lines in scripted_day(vendor) for line in lines]
+    sent = [as_frame(line.split(" ")) for lines in scripted_day(vendor).values() for line in lines]
     assert len(sent) > 100
     assert not [frame for frame in sent if vendor.is_forbidden(frame)]
 
@@ -134,14 +129,14 @@ def test_no_frame_of_a_scripted_day_moves_by_itself_calibrates_or_writes_what_st
     ],
 )  # fmt: skip
 def test_what_no_driver_may_send_would_be_noticed(label, frames):
-    (vendor,) = [one for one in VENDORS if one.label == label]
     for text in frames:
         can_id, data = text.rstrip("x").split(" ")
         frame = CanFrame(int(can_id, 16), bytes.fromhex(data), text.endswith("x"))
-        assert vendor.is_forbidden(frame), text
+        assert BY_LABEL[label].is_forbidden(frame), text
 
 
 @pytest.mark.parametrize("vendor", MARKED_VENDORS, ids=str)
 def test_every_frame_of_a_scripted_day_is_the_one_that_was_recorded(vendor):
-    found = dict(zip(PHASES, sums(vendor), strict=True))
-    assert found == dict(zip(PHASES, SUMS[str(vendor)].split(), strict=True))
+    phases = scripted_day(vendor)
+    sums = {name: hashlib.sha256("\n".join(lines).encode()).hexdigest()[:6] for name, lines in phases.items()}
+    assert sums == dict(zip(phases, SUMS[str(vendor)].split(), strict=True))

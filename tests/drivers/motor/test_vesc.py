@@ -8,9 +8,20 @@ from drivers.motor import find_driver
 from drivers.types import DriverState, Request
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.test_motor_drivers import EXAMPLES, robot_toml
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-(VESC,) = [vendor for vendor in VENDORS if vendor.label == "vesc"]
+VESC = BY_LABEL["vesc"]
+
+
+@pytest.fixture
+def bench():
+    return VESC.bench()
+
+
+@pytest.fixture
+def idle_bench(bench):
+    bench.run_until(*IDLE_STATES)
+    return bench
 
 
 def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_it_holds(tmp_path):
@@ -20,27 +31,24 @@ def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_i
 
 
 @pytest.mark.parametrize("pause_s", [0.13, 0.5])
-def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(pause_s):
-    bench = VESC.bench().drive(1.0, FORWARD)
-    bench.host_runs = False
-    bench.run(pause_s)
-    bench.host_runs = True
+def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(bench, pause_s):
+    bench.drive(1.0, FORWARD)
+    bench.pause_host(pause_s)
     bench.run(0.05)
     assert bench.driver.state is not DriverState.ARMED
     bench.run(1.0, FORWARD)
     assert bench.robot.speed_rad_s < 0.05
 
 
-def test_a_controller_that_restarts_while_armed_is_lost():
-    bench = VESC.bench().drive(2.0, FORWARD)
+def test_a_controller_that_restarts_while_armed_is_lost(bench):
+    bench.drive(2.0, FORWARD)
     bench.robot.controller.restart()
     bench.run(0.1, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert "restarted" in bench.driver.detail
 
 
-def test_status_messages_that_are_off_are_asked_for_by_name():
-    bench = VESC.bench()
+def test_status_messages_that_are_off_are_asked_for_by_name(bench):
     for side in bench.robot.controller.sides:
         side[0].status_ms[27] = 0
     bench.run(1.0)
@@ -48,20 +56,18 @@ def test_status_messages_that_are_off_are_asked_for_by_name():
     assert "status messages 1 and 5" in bench.driver.detail
 
 
-def test_it_does_not_arm_while_a_motor_turns():
-    bench = VESC.bench()
-    bench.run_until(*IDLE_STATES)
-    bench.robot.speed = [2.0, 2.0]
-    bench.run(0.05)
-    bench.request(Request.ARM).run(0.05, FORWARD)
-    assert bench.driver.state in IDLE_STATES
-    assert "is turning" in bench.driver.detail
-    assert not [frame for frame in bench.robot.received if VESC.is_motion(frame)]
+def test_it_does_not_arm_while_a_motor_turns(idle_bench):
+    idle_bench.robot.speed = [2.0, 2.0]
+    idle_bench.run(0.05)
+    idle_bench.request(Request.ARM).run(0.05, FORWARD)
+    assert idle_bench.driver.state in IDLE_STATES
+    assert "is turning" in idle_bench.driver.detail
+    assert not [frame for frame in idle_bench.robot.received if VESC.is_motion(frame)]
 
 
-def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_that_says_nothing():
+def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_that_says_nothing(bench):
     """On a slope, a brake that is let go after a while would let the robot roll away."""
-    bench = VESC.bench().drive(1.0, FORWARD)
+    bench.drive(1.0, FORWARD)
     step = bench.robot.step
 
     def pushed(now_ns):
@@ -77,33 +83,24 @@ def test_it_brakes_for_as_long_as_a_motor_says_that_it_turns_and_lets_go_of_one_
     assert bench.robot.received[-1].can_id >> 8 != 2
 
 
-def test_it_is_armed_only_after_zeros_for_a_while():
-    bench = VESC.bench()
-    bench.run_until(*IDLE_STATES)
-    bench.robot.received.clear()
-    bench.drive(0.02)
-    zeros = [frame for frame in bench.robot.received if frame.can_id == 3 << 8 | 23]
+def test_it_is_armed_only_after_zeros_for_a_while(idle_bench):
+    idle_bench.robot.received.clear()
+    idle_bench.drive(0.02)
+    zeros = [frame for frame in idle_bench.robot.received if frame.can_id == 3 << 8 | 23]
     assert len(zeros) >= 10
     assert {frame.data for frame in zeros} == {bytes(4)}
 
 
-def test_a_fault_is_named_within_half_a_second():
-    bench = VESC.bench()
-    bench.run_until(*IDLE_STATES)
-    bench.robot.controller.sides[1][0].values.fault = 6
-    bench.run(0.5)
-    assert bench.driver.state is DriverState.FAULT
-    assert bench.driver.detail == "controller 51: the motor is too hot; let it cool; remove the cause, then reset"
-
-
-def test_the_questions_for_faults_do_not_feed_the_timeout():
-    bench = VESC.bench()
-    bench.run_until(*IDLE_STATES)
-    bench.run(2.0)
-    assert [vesc.fed for side in bench.robot.controller.sides for vesc in side] == [0, 0]
+def test_a_fault_is_named_within_half_a_second_and_the_questions_for_it_do_not_feed_the_timeout(idle_bench):
+    idle_bench.run(2.0)
+    sides = idle_bench.robot.controller.sides
+    assert [vesc.fed for side in sides for vesc in side] == [0, 0]
+    sides[1][0].values.fault = 6
+    idle_bench.run(0.5)
+    assert idle_bench.driver.state is DriverState.FAULT
+    assert idle_bench.driver.detail == "controller 51: the motor is too hot; let it cool; remove the cause, then reset"
 
 
 def test_the_emergency_stop_is_one_frame_to_all():
-    settings = VESC.settings
-    (frame,) = find_driver("vesc").stop_frames(settings)
+    (frame,) = find_driver("vesc").stop_frames(VESC.settings)
     assert (frame.can_id, frame.extended, frame.data.hex()) == (0x2FF, True, "00004e20")

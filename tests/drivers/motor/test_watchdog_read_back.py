@@ -9,38 +9,51 @@ from disco_hw.runtime.preflight import Level, check_watchdog
 from drivers.motor.vesc_codec import timeout
 from drivers.types import DriverState
 from tests.drivers.motor.bench import IDLE_STATES
-from tests.drivers.motor.vendors import VENDORS
+from tests.drivers.motor.vendors import BY_LABEL
 
-BY_LABEL = {vendor.label: vendor for vendor in VENDORS}
-
-
-def readable_odrive():
-    return replace(BY_LABEL["odrive-0.6"], changes="watchdog_endpoints = [220, 221]\n")
+ODRIVE = replace(BY_LABEL["odrive-0.6"], changes="watchdog_endpoints = [220, 221]\n")
+VESC = BY_LABEL["vesc"]
 
 
 def vescs(bench):
     return [vesc for side in bench.robot.controller.sides for vesc in side]
 
 
+def set_vesc(name, value):
+    return lambda bench: setattr(vescs(bench)[1], name, value)
+
+
+def set_odrive(number, value):
+    return lambda bench: bench.robot.controller.boards[1].parameters.update({number: value})
+
+
 @pytest.mark.parametrize(
-    ("field", "value", "expected_detail"),
+    ("vendor", "change", "expected_detail"),
     [
-        ("timeout_ms", 0, "controller 51: its timeout is off"),
-        ("timeout_ms", 1000, "controller 51: its timeout is 1 s; set 0.1 s there"),
-        ("timeout_brake_current_a", 30.0, "brakes with 30 A"),
+        (VESC, set_vesc("timeout_ms", 0), "controller 51: its timeout is off"),
+        (VESC, set_vesc("timeout_ms", 1000), "controller 51: its timeout is 1 s; set 0.1 s there"),
+        (VESC, set_vesc("timeout_brake_current_a", 30.0), "brakes with 30 A"),
+        (ODRIVE, set_odrive(220, bytes(4)), "node 5: its watchdog is off"),
+        (ODRIVE, set_odrive(221, struct.pack("<f", 2.0)), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
+        (
+            ODRIVE,
+            lambda bench: bench.robot.controller.boards[0].parameters.clear(),
+            "node 3 does not report its watchdog; correct link.watchdog_endpoints",
+        ),
     ],
+    ids=str,
 )
-def test_a_vesc_whose_timeout_is_another_is_refused(field, value, expected_detail):
-    bench = BY_LABEL["vesc"].bench()
-    setattr(vescs(bench)[1], field, value)
+def test_a_controller_whose_watchdog_is_another_or_not_where_it_should_be_is_refused(vendor, change, expected_detail):
+    bench = vendor.bench()
+    change(bench)
     bench.run_until(DriverState.REFUSED)
     assert expected_detail in bench.driver.detail
     assert bench.driver.identity is bench.driver.limits is None
-    assert not [frame for frame in bench.robot.received if BY_LABEL["vesc"].is_motion(frame)]
+    assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
 
 
 def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():
-    bench = BY_LABEL["vesc"].bench()
+    bench = VESC.bench()
     for vesc in vescs(bench):
         obey = vesc._obey
         vesc._obey = lambda payload, behind, obey=obey: (None, []) if payload[:1] == b"\x11" else obey(payload, behind)
@@ -54,32 +67,11 @@ def test_settings_of_another_layout_or_controller_are_not_used(payload):
 
 
 @pytest.mark.parametrize(
-    ("number", "value", "expected_detail"),
-    [
-        (220, bytes(4), "node 5: its watchdog is off"),
-        (221, struct.pack("<f", 2.0), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
-    ],
-)
-def test_an_odrive_whose_watchdog_is_another_is_refused(number, value, expected_detail):
-    bench = readable_odrive().bench()
-    bench.robot.controller.boards[1].parameters[number] = value
-    bench.run_until(DriverState.REFUSED)
-    assert expected_detail in bench.driver.detail
-
-
-def test_an_odrive_that_does_not_answer_for_the_endpoints_given_is_refused():
-    bench = readable_odrive().bench()
-    bench.robot.controller.boards[0].parameters.clear()
-    bench.run_until(DriverState.REFUSED)
-    assert "node 3 does not report its watchdog; correct link.watchdog_endpoints" in bench.driver.detail
-
-
-@pytest.mark.parametrize(
     ("vendor", "level", "expected_text"),
     [
         (BY_LABEL["odrive-0.5"], Level.WARNING, "could not be read back"),
-        (readable_odrive(), Level.OK, "reported by the controller"),
-        (BY_LABEL["vesc"], Level.OK, "reported by the controller"),
+        (ODRIVE, Level.OK, "reported by the controller"),
+        (VESC, Level.OK, "reported by the controller"),
         (BY_LABEL["agilex"], Level.OK, "cannot be set otherwise"),
         (BY_LABEL["roboclaw"], Level.OK, "reported by the controller"),
     ],

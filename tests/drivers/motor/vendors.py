@@ -81,12 +81,8 @@ def is_odrive_forbidden(frame):
     return (command, len(data)) not in ((0x0D, 8), (0x18, 1)) and not (command == 0x04 and data[0] == 0)
 
 
-def fail_left_vesc(rig):
-    rig.controller.sides[0][0].values.fault = 4
-
-
-def mend_vesc(rig):
-    rig.controller.sides[0][0].values.fault = 0
+def set_left_vesc_fault(number):
+    return lambda rig: setattr(rig.controller.sides[0][0].values, "fault", number)
 
 
 def is_vesc_motion(frame):
@@ -119,12 +115,8 @@ def is_agilex_forbidden(frame):
     return len(frame.data) != lengths.get(frame.can_id) or (frame.can_id == 0x421 and frame.data[0] > 1)
 
 
-def fail_left_roboclaw(rig):
-    rig.controller.boards[128].registers.status = 0x40
-
-
-def mend_roboclaw(rig):
-    rig.controller.boards[128].registers.status = 0
+def set_left_roboclaw_status(status):
+    return lambda rig: setattr(rig.controller.boards[128].registers, "status", status)
 
 
 def is_roboclaw_motion(frame):
@@ -141,12 +133,8 @@ def is_roboclaw_forbidden(frame):
     return command not in (14, 15, 21, 40, 55, 56, 78, 79, 90, 200)
 
 
-def lose_left_ros2_base(rig):
-    rig.controller.joints = False
-
-
-def mend_ros2_base(rig):
-    rig.controller.joints = True
+def set_ros2_base_odometry(is_sent):
+    return lambda rig: setattr(rig.controller, "joints", is_sent)
 
 
 def is_ros2_base_motion(frame):
@@ -164,8 +152,8 @@ ODRIVE = partial(
     lose_left=fail_left_odrive, is_motion=is_odrive_motion, is_forbidden=is_odrive_forbidden,
 )  # fmt: skip
 VESC = partial(
-    Vendor, "vesc", watchdog_s=0.11, mend=mend_vesc,
-    lose_left=fail_left_vesc, is_motion=is_vesc_motion, is_forbidden=is_vesc_forbidden,
+    Vendor, "vesc", watchdog_s=0.11, mend=set_left_vesc_fault(0),
+    lose_left=set_left_vesc_fault(4), is_motion=is_vesc_motion, is_forbidden=is_vesc_forbidden,
 )  # fmt: skip
 ROBOCLAW = partial(
     Vendor, "roboclaw", watchdog_s=0.2, foreign=None, is_motion=is_roboclaw_motion, is_forbidden=is_roboclaw_forbidden
@@ -185,7 +173,7 @@ VENDORS = (
         "agilex", "agilex", watchdog_s=0.5, foreign=CanFrame(0x111, b"\0\x10" + bytes(6)),
         lose_left=fail_left_agilex, is_motion=is_agilex_motion, is_forbidden=is_agilex_forbidden,
     ),
-    ROBOCLAW("roboclaw", lose_left=fail_left_roboclaw, mend=mend_roboclaw),
+    ROBOCLAW("roboclaw", lose_left=set_left_roboclaw_status(0x40), mend=set_left_roboclaw_status(0)),
     ROBOCLAW(
         "roboclaw-a-board-a-side",
         'motors = [["128/1", "128/2"], ["129/1", "129/2"]]\n',
@@ -193,7 +181,9 @@ VENDORS = (
         mend=lambda rig: rig.controller.dead.clear(),
     ),
     Vendor(
-        "ros2_base", "ros2-base", watchdog_s=0.2, foreign=CanFrame(0x012, bytes(8)), mend=mend_ros2_base,
-        lose_left=lose_left_ros2_base, is_motion=is_ros2_base_motion, is_forbidden=is_ros2_base_forbidden,
+        "ros2_base", "ros2-base", watchdog_s=0.2, foreign=CanFrame(0x012, bytes(8)),
+        lose_left=set_ros2_base_odometry(False), mend=set_ros2_base_odometry(True),
+        is_motion=is_ros2_base_motion, is_forbidden=is_ros2_base_forbidden,
     ),
 )  # fmt: skip
+BY_LABEL = {vendor.label: vendor for vendor in VENDORS}

@@ -12,21 +12,14 @@ from disco_hw.runtime.assembly import driver_of, pose_source_of
 from drivers.motor import RewiredDriver
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample
-
-ROBOT = """[robot]
-name = "bench"
-wheel_radius_m = 0.06
-axial_distance_m = 0.31
-ticks_per_rev = 2048
-max_wheel_speed_rad_s = 8.0
-"""
+from tests.config.test_robot import GOOD
 
 
 @pytest.fixture
 def load(tmp_path):
     def loaded(text):
         path = tmp_path / "robot.toml"
-        path.write_text(ROBOT + text, encoding="utf-8")
+        path.write_text(GOOD + text, encoding="utf-8")
         return load_robot_config(path)
 
     return loaded
@@ -58,15 +51,17 @@ def test_robot_toml_says_how_the_wheels_are_wired(load):
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("text", "expected_error"),
     [
         ("[wheels]\nmotor_direction = [1, 2]\n", "wheels.motor_direction"),
         ("[wheels]\nturn_ratio = 0.0\n", "wheels.turn_ratio"),
         ('[pose]\nposition_unit = "inch"\n', "pose.position_unit"),
+        ("[pose]\noffset = [nan, 0.0]\n", r"pose\.offset: not a finite number; write"),
+        ("[pose]\norigin = [0.0, inf, 0.0]\n", r"pose\.origin: not a finite number; write"),
     ],
 )
-def test_a_wrong_one_is_refused_by_its_name(load, text, named):
-    with pytest.raises(InputError, match=named):
+def test_a_wrong_one_is_refused_by_its_name(load, text, expected_error):
+    with pytest.raises(InputError, match=expected_error):
         load(text)
 
 
@@ -94,12 +89,6 @@ def test_robot_toml_says_where_the_sensor_is(load):
     source = pose_source_of(load("[pose]\norigin = [1.0, 0.0, 0.0]\noffset = [0.5, 0.0]\nlatency_s = 0.1\n"))
     (found,) = source.receive(3, [PoseSample(10**9, 2, 1.0, 2.0, 0.0, 5.0, 0.1)])
     assert (found.t_ns, found.x_m, found.y_m) == (900_000_000, 1.5, 2.0)
-
-
-@pytest.mark.parametrize("line", ["offset = [nan, 0.0]", "origin = [0.0, inf, 0.0]"])
-def test_a_place_that_is_no_number_is_refused(load, line):
-    with pytest.raises(InputError, match=rf"pose\.{line.split()[0]}: not a finite number; write"):
-        load(f"[pose]\n{line}\n")
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.natnet import VERSIONS, parse_frame, plane_pose
-from tests.drivers.pose.test_nmea import until
+from tests.drivers.waiting import receive_until
 from tests.tables import examples
 
 # Turned by 0.7 rad about Motive's upward axis y, at 1.5 m along x and 2 m towards the viewer (z).
@@ -27,7 +27,7 @@ def count(version, items):
     return struct.pack("<i", len(items)) + (struct.pack("<i", len(body)) if version >= (4, 1) else b"") + body
 
 
-def rigid_body(version, number, position, rotation, tracked=True):
+def rigid_body(version, number=3, position=(1.5, 0.1, -2.0), rotation=TURNED, tracked=True):
     body = struct.pack("<i3f4f", number, *position, *rotation)
     if version < (3, 0):
         body += struct.pack("<i6f2i2f", 2, *[0.1] * 6, 7, 8, 0.01, 0.01)
@@ -70,7 +70,7 @@ def frame(version, bodies, timestamp_s=12.5, exposed=1000 * TEN_MHZ, age_ticks=5
 @pytest.mark.parametrize("empty", [False, True])
 def test_every_version_gives_the_body_and_the_clock(version, empty):
     bodies = [
-        rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED),
+        rigid_body(version),
         rigid_body(version, 4, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), tracked=False),
     ]
     found = parse_frame(frame(version, bodies, empty=empty), version)
@@ -87,7 +87,7 @@ def test_another_library_reads_the_same(version):
     from natnet.packet_buffer import PacketBuffer
     from natnet.version import Version
 
-    datagram = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])
+    datagram = frame(version, [rigid_body(version)])
     buffer = PacketBuffer(datagram)
     buffer.pointer = 4
     theirs = library.DataFrame.read_from_buffer(buffer, Version(*version))
@@ -135,7 +135,7 @@ def test_axes_that_are_z_up_already_stay():
 )
 def test_no_bytes_break_it(datagram, version, at, change):
     assert parse_frame(datagram, version) is None or datagram[:2] == b"\x07\x00"
-    valid_frame = frame(version, [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)])
+    valid_frame = frame(version, [rigid_body(version)])
     parse_frame(valid_frame[:at] + change + valid_frame[at + len(change) :], version)
     assert parse_frame(valid_frame[: min(at, 60)], version) is None
 
@@ -152,25 +152,25 @@ class Motive:
             self.socket.sendto(datagram, (group, port))
 
 
-def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
+def test_by_multicast_with_the_exposures_age_and_a_lost_body(create_source, port):
     version, motive = (3, 0), Motive()
-    source = create_pose_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
-    body = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)
+    source = create_source("natnet", data_port=port, body=3, position_std_m=0.002, yaw_std_rad=0.004)
+    body = rigid_body(version)
     # The clock's frequency shows in half a second of the server's own time.
     motive.send(port, frame(version, [body], timestamp_s=1.0, exposed=TEN_MHZ))
     motive.send(port, frame(version, [body], timestamp_s=2.0, exposed=2 * TEN_MHZ))
-    found, messages = until(source, lambda found, _: len(found) == 2)
+    found, messages = receive_until(source, lambda found, _: len(found) == 2)
     assert messages == ["rigid body 3 is tracked"]
     # The first one's age is not known; the second was exposed 5 ms before it was sent.
     assert {pose.received_ns - pose.t_ns for pose in found} == {0, 5_000_000}
     assert (found[1].x_m, found[1].y_m, found[1].yaw_rad) == pytest.approx((1.5, 2.0, 0.7), abs=1e-6)
     assert (found[1].position_std_m, found[1].yaw_std_rad) == (0.002, 0.004)
-    unseen = rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED, tracked=False)
-    nan = rigid_body(version, 3, (math.nan, 0.1, -2.0), TURNED)
+    unseen = rigid_body(version, tracked=False)
+    nan = rigid_body(version, position=(math.nan, 0.1, -2.0))
     motive.send(
         port, frame(version, [unseen]), frame(version, [nan]), frame(version, [unseen]), b"hello", frame(version, [])
     )
-    found, messages = until(source, lambda _, messages: len(messages) == 3)
+    found, messages = receive_until(source, lambda _, messages: len(messages) == 3)
     assert found == []
     assert messages[0] == "the cameras do not see rigid body 3; check its markers"
     assert messages[1] == "datagrams received that are not frames of NatNet 3.0; correct pose.natnet_version"
@@ -181,12 +181,12 @@ def test_by_multicast_with_the_exposures_age_and_a_lost_body(port):
     assert list(source.receive(1, ())) == []
 
 
-def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, monkeypatch):
+def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(create_source, port, monkeypatch):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(("127.0.0.1", 0))
         server.settimeout(60.0)
         monkeypatch.setattr("drivers.pose.natnet.COMMAND_PORT", server.getsockname()[1])
-        source = create_pose_source("natnet", data_port=port, server="127.0.0.1", natnet_version="2.9", body=3)
+        source = create_source("natnet", data_port=port, server="127.0.0.1", natnet_version="2.9", body=3)
         assert list(source.receive(0, ())) == []
         connect, client = server.recvfrom(100)
         keep_alive, _ = server.recvfrom(100)
@@ -195,8 +195,8 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(port, mo
             b"Motive".ljust(256, b"\0") + bytes([3, 1, 0, 0, 4, 1, 0, 0]) + struct.pack("<QHB4s", TEN_MHZ, 1511, 0, b"")
         )
         server.sendto(struct.pack("<HH", 1, len(about)) + about, client)
-        server.sendto(frame((4, 1), [rigid_body((4, 1), 3, (1.5, 0.1, -2.0), TURNED)]), client)
-        (pose,), _ = until(source, lambda found, _: found)
+        server.sendto(frame((4, 1), [rigid_body((4, 1))]), client)
+        (pose,), _ = receive_until(source, lambda found, _: found)
         assert pose.received_ns - pose.t_ns == 5_000_000
         source.close()
 
@@ -206,25 +206,24 @@ def test_an_address_that_is_not_this_computers_is_one_line():
         create_pose_source("natnet", address="203.0.113.7")
 
 
-def test_frames_of_a_second_server_are_refused_and_named(port):
+def test_frames_of_a_second_server_are_refused_and_named(create_source, port):
     version = (3, 0)
-    source = create_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+    source = create_source("natnet", data_port=port, server="127.0.0.1", body=3)
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as two,
     ):
         for sender, x_m in ((one, 1.0), (two, 5.0), (one, 1.1)):
-            sender.sendto(frame(version, [rigid_body(version, 3, (x_m, 0.1, -2.0), TURNED)]), ("127.0.0.1", port))
+            sender.sendto(frame(version, [rigid_body(version, position=(x_m, 0.1, -2.0))]), ("127.0.0.1", port))
         names = [f"127.0.0.1:{sender.getsockname()[1]}" for sender in (one, two)]
-        found, messages = until(source, lambda found, _: len(found) == 2)
+        found, messages = receive_until(source, lambda found, _: len(found) == 2)
     assert [pose.x_m for pose in found] == pytest.approx([1.0, 1.1])
     assert any(f"{names[1]} sends poses while {names[0]} does: not used" in message for message in messages)
-    source.close()
 
 
 def test_a_frame_with_more_than_motive_can_send_is_none():
     version = (3, 0)
-    one = [rigid_body(version, 3, (1.5, 0.1, -2.0), TURNED)]
+    one = [rigid_body(version)]
     valid_frame = frame(version, one, empty=True)
     # After size, number of the frame and its head: so many marker sets, none of which has a name or a marker.
     sets = b"\0" + struct.pack("<i", 0)
@@ -234,8 +233,8 @@ def test_a_frame_with_more_than_motive_can_send_is_none():
         assert (found is not None) == is_read
 
 
-def test_a_flood_of_long_datagrams_waits_for_the_next_tick(port):
-    source = create_pose_source("natnet", data_port=port, server="127.0.0.1", body=3)
+def test_a_flood_of_long_datagrams_waits_for_the_next_tick(create_source, port):
+    source = create_source("natnet", data_port=port, server="127.0.0.1", body=3)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for _ in range(3):
             sender.sendto(bytes(40_000), ("127.0.0.1", port))
@@ -243,4 +242,3 @@ def test_a_flood_of_long_datagrams_waits_for_the_next_tick(port):
     assert source.malformed == 2
     assert list(source.receive(2, ())) == []
     assert source.malformed == 3
-    source.close()

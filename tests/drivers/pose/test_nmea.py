@@ -13,6 +13,7 @@ import pytest
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.nmea import QUALITY_STD_M, Fixes, ReceiverClock, TangentPlane
+from tests.drivers.waiting import receive_until
 from tests.runtime.simulated import simulated_stack
 
 pytest.importorskip("pynmeagps", reason="pip install 'disco-hw[rtk]'")
@@ -144,79 +145,56 @@ def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     assert night.host_ns(18.0, 2 * 10**9) == 2 * 10**9
 
 
-@pytest.fixture
-def ended():
-    sources = []
-    yield sources.append
-    for source in sources:
-        source.close()
-
-
-def until(source, enough):
-    """Poses and messages of the source until `enough(poses, messages)`, within a generous time."""
-    found, messages = [], []
-    end_s = time.monotonic() + 60.0
-    while not enough(found, messages):
-        assert time.monotonic() < end_s, (found, messages)
-        found += source.receive(time.monotonic_ns(), ())
-        messages += source.new_messages()
-        time.sleep(0.01)
-    return found, messages
-
-
 def opened(source):
     """Wait until it listens: what came before the port was open is thrown away."""
-    until(source, lambda _, messages: any(message.endswith(": open") for message in messages))
+    receive_until(source, lambda _, messages: any(message.endswith(": open") for message in messages))
 
 
-def test_over_a_serial_port_that_goes_away(ended):
+def test_over_a_serial_port_that_goes_away(create_source):
     master, slave = os.openpty()
     tty.setraw(slave)
-    source = create_pose_source("nmea", device=os.ttyname(slave), baud=115_200)
-    ended(source)
-    _, messages = until(source, lambda _, messages: messages)
+    source = create_source("nmea", device=os.ttyname(slave), baud=115_200)
+    _, messages = receive_until(source, lambda _, messages: messages)
     assert messages[0].endswith(": open")
     os.write(master, b"half a line*00\r\n" + GGA_ALONE)
-    (pose,), messages = until(source, lambda found, _: found)
+    (pose,), messages = receive_until(source, lambda found, _: found)
     assert (pose.x_m, pose.y_m, pose.has_heading) == (0.0, 0.0, False)
     assert 0 <= time.monotonic_ns() - pose.t_ns < 60 * 10**9
     assert any("fix quality 1" in message for message in messages)
     os.close(slave)
     os.close(master)
-    _, messages = until(source, lambda _, messages: messages)
+    _, messages = receive_until(source, lambda _, messages: messages)
     assert "trying again until it is there" in messages[-1]
 
 
-def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(ended):
+def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(create_source):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-        source = create_pose_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
-        ended(source)
+        source = create_source("nmea", device=f"socket://127.0.0.1:{port}", datum=(47.0, 8.5))
         receiver, _ = server.accept()
         opened(source)
         with receiver:
             receiver.sendall(bytes(range(256)) * 20 + b"\n" + GGA_ALONE)
-            (pose,), _ = until(source, lambda found, _: found)
+            (pose,), _ = receive_until(source, lambda found, _: found)
         assert (pose.x_m, pose.y_m) != (0.0, 0.0)
-        until(source, lambda _, messages: any("trying again" in message for message in messages))
+        receive_until(source, lambda _, messages: any("trying again" in message for message in messages))
         again, _ = server.accept()
         opened(source)
         with again:
             again.sendall(gga(40_000.0, 47.0, 8.5))
-            (pose,), _ = until(source, lambda found, _: found)
+            (pose,), _ = receive_until(source, lambda found, _: found)
             assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=1e-3)
 
 
-def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(ended):
+def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(create_source):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        source = create_pose_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
-        ended(source)
+        source = create_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
         receiver, _ = server.accept()
         opened(source)
         stack = simulated_stack(NoPlanner())
         stack.core.pose_source = source
         receiver.sendall(GGA_ALONE)
-        until(source, lambda found, _: found)
+        receive_until(source, lambda found, _: found)
         os.kill(source._process.pid, signal.SIGKILL)
         source._process.wait(60.0)
         (tick, *_) = [tick for tick in stack.run(0.1) if any("has ended" in event for event in tick.events)]

@@ -14,9 +14,10 @@ from drivers.pose.ros2 import bridge_address
 PORT = 40_000 + os.getpid() % 20_000
 NOW_NS = 100_000_000_000
 POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
-AS_A_STRANGER = """
+FROM_ANOTHER_PROCESS = """
 import os, socket, sys
-os.setuid(65534)
+if sys.argv[2]:
+    os.setuid(int(sys.argv[2]))
 socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(sys.stdin.buffer.read(), bytes.fromhex(sys.argv[1]))
 """
 
@@ -34,6 +35,11 @@ def send_datagrams(*datagrams):
             sender.sendto(datagram, bridge_address(PORT))
 
 
+def send_from_another_process(datagram, user=""):
+    command = [sys.executable, "-c", FROM_ANOTHER_PROCESS, bridge_address(PORT).hex(), user]
+    subprocess.run(command, input=datagram, check=True, timeout=60)
+
+
 def test_poses_come_in_the_order_of_their_times_and_the_rest_is_counted(source):
     send_datagrams(*(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS - age}) for age in (10, 50)), b"hello", b"")
     assert [NOW_NS - pose.t_ns for pose in source.receive(NOW_NS, ())] == [50, 10]
@@ -44,26 +50,16 @@ def test_poses_come_in_the_order_of_their_times_and_the_rest_is_counted(source):
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")
 def test_what_another_user_says_does_not_count(source):
-    datagram = msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS})
-    address = bridge_address(PORT).hex()
-    subprocess.run([sys.executable, "-c", AS_A_STRANGER, address], input=datagram, check=True, timeout=60)
+    send_from_another_process(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS}), user="65534")
     assert list(source.receive(NOW_NS, ())) == []
     assert source.refused == 1
     (text,) = source.new_messages()
     assert "of user 65534 sends poses to the bridge's port: not used (1 datagrams); only the daemon's user" in text
 
 
-ANOTHER_BRIDGE = """
-import socket, sys
-socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(sys.stdin.buffer.read(), bytes.fromhex(sys.argv[1]))
-"""
-
-
 def test_a_second_bridge_is_refused_and_named(source):
     send_datagrams(msgspec.msgpack.encode({**POSE, "t_ns": NOW_NS}), msgspec.json.encode({"said": "hello"}))
-    datagram = msgspec.msgpack.encode({**POSE, "x_m": 9.0, "t_ns": NOW_NS})
-    address = bridge_address(PORT).hex()
-    subprocess.run([sys.executable, "-c", ANOTHER_BRIDGE, address], input=datagram, check=True, timeout=60)
+    send_from_another_process(msgspec.msgpack.encode({**POSE, "x_m": 9.0, "t_ns": NOW_NS}))
     assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
     greeting, refused = source.new_messages()
     assert greeting == "hello"

@@ -13,7 +13,6 @@ import pytest
 
 from drivers.pose import PoseSourceError, create_pose_source
 from drivers.pose.senders import PoseProof, SenderGate, parse_allowed
-from tests.drivers.waiting import free_port
 
 KEY = bytes(range(16))
 NOW_NS = 100_000_000_000
@@ -111,9 +110,8 @@ def test_each_proven_datagram_counts_once_and_none_from_before_the_port_was_open
     assert isinstance(again.unwrap(second, WALL_NS + 60), str)
 
 
-def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
-    port = free_port(socket.SOCK_DGRAM)
-    source = create_pose_source("udp", port=port, key_file="pose.key", key=KEY)
+def test_over_a_real_socket_only_the_holder_of_the_key_is_heard(create_source, port):
+    source = create_source("udp", port=port, key_file="pose.key", key=KEY)
     body = json.dumps(POSE).encode()
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
@@ -128,23 +126,20 @@ def test_over_a_real_socket_only_the_holder_of_the_key_is_heard():
     assert source.refused == 2
     (message,) = source.new_messages()
     assert "sends poses without the authentication code of pose.key_file: not used" in message
-    source.close()
 
 
-def test_the_pages_sender_with_a_key(tmp_path, monkeypatch):
+def test_the_pages_sender_with_a_key(create_source, port, tmp_path, monkeypatch):
     page = (Path(__file__).parents[3] / "docs/poses.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"\n(    import hashlib.*?5005\)\)\n)", page, flags=re.DOTALL)
-    port = free_port(socket.SOCK_DGRAM)
     (tmp_path / "pose.key").write_text(KEY.hex() + "\n", encoding="utf-8")
     monkeypatch.chdir(tmp_path)
-    source, names = create_pose_source("udp", port=port, key=KEY), {}
+    source, names = create_source("udp", port=port, key=KEY), {}
     exec(textwrap.dedent(code).replace("5005", str(port)), names)
     names["send"](POSE)
     assert [pose.x_m for pose in source.receive(NOW_NS, ())] == [1.0]
     names["sender"].close()
-    source.close()
 
 
-def test_a_key_that_is_named_and_was_not_read_opens_nothing():
+def test_a_key_that_is_named_and_was_not_read_opens_nothing(port):
     with pytest.raises(PoseSourceError, match=r"the key of pose\.key was not read"):
-        create_pose_source("udp", port=free_port(socket.SOCK_DGRAM), key_file="pose.key")
+        create_pose_source("udp", port=port, key_file="pose.key")

@@ -6,7 +6,6 @@ import re
 import shutil
 import socket
 import subprocess
-import time
 from pathlib import Path
 
 import msgspec
@@ -14,8 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.pose import PoseSourceError, create_pose_source
+from drivers.pose import PoseSourceError
 from drivers.pose.udp import pose_of
+from tests.drivers.waiting import receive_until
 
 NOW_NS = 100_000_000_000
 POSE = {"x_m": 1.0, "y_m": -2.0, "yaw_rad": 0.5, "position_std_m": 0.01, "yaw_std_rad": 0.02}
@@ -82,8 +82,8 @@ def test_no_bytes_break_it(datagram):
     assert pose_of(datagram, NOW_NS).startswith("what cannot be read as one (")
 
 
-def test_over_a_real_socket_in_order_and_the_malformed_counted_and_said(port):
-    source = create_pose_source("udp", port=port)
+def test_over_a_real_socket_in_order_and_the_malformed_counted_and_said(create_source, port):
+    source = create_source("udp", port=port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for age_s in (0.01, 0.05):
             sender.sendto(json.dumps({**POSE, "age_s": age_s}).encode(), ("127.0.0.1", port))
@@ -100,11 +100,10 @@ def test_over_a_real_socket_in_order_and_the_malformed_counted_and_said(port):
     assert list(source.receive(NOW_NS, ())) == []
 
 
-def test_a_port_that_is_taken_is_refused_in_one_line(port):
-    first = create_pose_source("udp", port=port)
+def test_a_port_that_is_taken_is_refused_in_one_line(create_source, port):
+    create_source("udp", port=port)
     with pytest.raises(PoseSourceError, match=rf"127\.0\.0\.1:{port}: .*; choose another pose\.port"):
-        create_pose_source("udp", port=port)
-    first.close()
+        create_source("udp", port=port)
 
 
 def sent_from_the_page(language, port):
@@ -115,23 +114,18 @@ def sent_from_the_page(language, port):
 
 
 def arrived(source):
-    end_s = time.monotonic() + 60.0
-    while not (poses := source.receive(NOW_NS, ())):
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
-    source.close()
-    (pose,) = poses
-    return pose.x_m, pose.y_m, pose.yaw_rad, NOW_NS - pose.t_ns
+    (pose,), _ = receive_until(source, lambda found, _: found)
+    return pose.x_m, pose.y_m, pose.yaw_rad, pose.received_ns - pose.t_ns
 
 
-def test_the_pages_sender_in_python(port):
-    source, names = create_pose_source("udp", port=port), {}
+def test_the_pages_sender_in_python(create_source, port):
+    source, names = create_source("udp", port=port), {}
     exec(sent_from_the_page("python", port), names)
     names["send"](1.5, -2.0, 0.25, 0.04)
     assert arrived(source) == (1.5, -2.0, 0.25, 40_000_000)
 
 
-def test_the_pages_sender_in_cpp(port, tmp_path):
+def test_the_pages_sender_in_cpp(create_source, port, tmp_path):
     compiler = shutil.which("c++")
     if compiler is None:
         pytest.skip("no C++ compiler")
@@ -140,6 +134,6 @@ def test_the_pages_sender_in_cpp(port, tmp_path):
     )
     command = [compiler, "-std=c++11", "-Wall", "-Wextra", "-Werror", "-o", tmp_path / "send", tmp_path / "send.cpp"]
     subprocess.run(command, check=True, timeout=120)
-    source = create_pose_source("udp", port=port)
+    source = create_source("udp", port=port)
     subprocess.run([tmp_path / "send"], check=True, timeout=60)
     assert arrived(source) == (1.5, -2.0, 0.25, 40_000_000)

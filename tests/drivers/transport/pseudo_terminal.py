@@ -38,7 +38,7 @@ class PseudoTerminal:
         self.path.unlink()
         os.close(self._master)
 
-    def remove(self):
+    def close(self):
         """Vanish for good."""
         self.unplug()
         self._directory.cleanup()

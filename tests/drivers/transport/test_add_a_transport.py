@@ -3,6 +3,7 @@
 import errno
 import socket
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import drivers.transport
 from disco_hw.config.robot import Link
 from drivers.transport import TransportSettingsError, create_transport, media
 from drivers.types import Frame, LinkState
+from tests.drivers.transport.links import up
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
 EXAMPLE = Path(__file__).parents[3] / "docs/examples/udp.py"
@@ -38,11 +40,10 @@ def controller():
 @pytest.fixture
 def transport(_in_the_folder, controller):
     link = Link(kind="udp", channel=f"127.0.0.1:{controller.getsockname()[1]}")
-    transport = create_transport(**link.medium_fields())
-    transport.open()
-    wait_until(lambda: transport.state is LinkState.UP)
-    yield transport
-    transport.close()
+    with closing(create_transport(**link.medium_fields())) as transport:
+        transport.open()
+        up(transport)
+        yield transport
 
 
 def test_frames_go_both_ways_and_what_is_none_is_counted(transport, controller):

@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import closing
+from collections import Counter
 
 import can
 import can.interfaces.virtual as virtual_bus
@@ -29,15 +29,9 @@ from drivers.transport.can import (
     monotonic_stamp_ns,
     require_working_interface,
 )
-from drivers.transport.reconnecting import (
-    BackoffPolicy,
-    LinkLostError,
-    ReconnectingTransport,
-    TransmitBusyError,
-    TransportCounters,
-)
+from drivers.transport.reconnecting import LinkLostError, TransmitBusyError, TransportCounters
 from drivers.types import Frame, LinkState, OutgoingFrame
-from tests.drivers.transport.pseudo_terminal import PseudoTerminal
+from tests.drivers.transport.links import opened, up
 from tests.drivers.waiting import collect, free_port, median_send_s, outgoing, send, wait_until
 from tests.sim.hub_process import HUB_PROCESS
 from tests.tables import examples
@@ -74,25 +68,12 @@ def test_any_error_frame_is_counted_somehow(error_class, data):
     assert set(error_counts(error_class, data).values()) <= {0, 1}
 
 
-A, B = Frame(0x100, b"\1"), Frame(0x100, b"\2")
+A, B, C = Frame(0x100, b"\1"), Frame(0x100, b"\2"), Frame(0x101, b"\1")
 
 
 @pytest.fixture
 def sent_frames():
     return SentFrames()
-
-
-def test_each_frame_sent_excuses_one_that_is_equal(sent_frames):
-    sent_frames.sent(0, A)
-    sent_frames.sent(0, A)
-    assert [sent_frames.is_echo(1, A) for _ in range(3)] == [True, True, False]
-
-
-def test_another_frame_is_no_echo_and_takes_no_excuse(sent_frames):
-    sent_frames.sent(0, A)
-    assert not sent_frames.is_echo(1, B)
-    assert not sent_frames.is_echo(1, Frame(0x101, A.data))
-    assert sent_frames.is_echo(1, A)
 
 
 def test_an_excuse_ends_after_a_second(sent_frames):
@@ -110,43 +91,34 @@ def test_a_frame_that_was_not_sent_excuses_nothing(sent_frames):
     sent_frames.not_sent(B)
 
 
-@examples(quick=40, every=100, events=st.lists(st.tuples(st.sampled_from([A, B]), st.booleans()), max_size=40))
+@examples(quick=40, every=100, events=st.lists(st.tuples(st.sampled_from([A, B, C]), st.booleans()), max_size=40))
 def test_whoever_else_sends_is_heard_as_often_as_he_sends(events):
     """Echoes and another host's frames of the same contents, in any order: what is not excused is as many as his."""
     sent_frames = SentFrames()
     for frame, is_ours in events:
         if is_ours:
             sent_frames.sent(0, frame)
-    not_echoes = [frame for frame, _ in events if not sent_frames.is_echo(1, frame)]
-    strangers = [frame for frame, is_ours in events if not is_ours]
-    assert sorted(not_echoes, key=lambda frame: frame.data) == sorted(strangers, key=lambda frame: frame.data)
+    not_echoes = Counter(frame for frame, _ in events if not sent_frames.is_echo(1, frame))
+    assert not_echoes == Counter(frame for frame, is_ours in events if not is_ours)
 
 
-FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
 CHANNELS = (f"can-test-{number}" for number in itertools.count())
 
 
-def opened(interface, channel, bitrate=500_000, **options):
-    transport = ReconnectingTransport(
-        CanMedium(interface, channel, bitrate, options), backoff=FAST, carries_extended=True
-    )
-    transport.open()
-    return transport
+def opened_bus(interface, channel, bitrate=500_000, **options):
+    return opened(CanMedium(interface, channel, bitrate, options), carries_extended=True)
 
 
-def up(transport, generation=1):
-    wait_until(lambda: transport.state is LinkState.UP and transport.generation >= generation)
+def other_node(interface, channel, **options):
+    return can.Bus(interface=interface, channel=channel, ignore_config=True, **options)
 
 
 @pytest.fixture
 def virtual():
     channel = next(CHANNELS)
-    other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-    transport = opened("virtual", channel)
-    up(transport)
-    yield transport, other
-    transport.close()
-    other.shutdown()
+    with other_node("virtual", channel) as other, opened_bus("virtual", channel) as transport:
+        up(transport)
+        yield transport, other
 
 
 def message(can_id=0x110, data=b"\x01\x02", **options):
@@ -213,8 +185,7 @@ def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
     (tmp_path / "can.ini").write_text("[default]\nreceive_own_messages = True\n")
     monkeypatch.setenv("CAN_CONFIG", '{"receive_own_messages": true}')
     channel = next(CHANNELS)
-    other = can.Bus(interface="virtual", channel=channel, ignore_config=True)
-    with other, closing(opened("virtual", channel)) as transport:
+    with other_node("virtual", channel) as other, opened_bus("virtual", channel) as transport:
         up(transport)
         send(transport, outgoing(0x100, b"ours"))
         other.recv(5.0)
@@ -256,8 +227,10 @@ def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(inte
     else:
         # A free port, so that runs side by side do not hear each other.
         channel, options, own = MULTICAST_GROUP, {"port": free_port(socket.SOCK_DGRAM), "hop_limit": 0}, {}
-    other = can.Bus(interface=interface, channel=channel, ignore_config=True, **options)
-    with other, closing(opened(interface, channel, **options, **own)) as transport:
+    with (
+        other_node(interface, channel, **options) as other,
+        opened_bus(interface, channel, **options, **own) as transport,
+    ):
         up(transport)
         for number in range(5):
             send(transport, outgoing(0x100, bytes((number,))))
@@ -339,7 +312,7 @@ class SocketcandServer:
 
 def test_socketcand_by_host_and_port_from_the_options():
     server = SocketcandServer()
-    with closing(opened("socketcand", "can7", host="127.0.0.1", port=server.port)) as transport:
+    with opened_bus("socketcand", "can7", host="127.0.0.1", port=server.port) as transport:
         up(transport)
         assert server.opened == [["open", "can7"], ["rawmode"]]
         server.send(0x110, b"\x11\x22")
@@ -358,61 +331,33 @@ def test_socketcand_by_host_and_port_from_the_options():
         wait_until(lambda: "start the other end first" in (transport.last_error or ""))
 
 
-def test_a_bus_over_a_port_that_stays_mute_is_opened_again():
-    terminal = PseudoTerminal()
-    medium = CanMedium("slcan", str(terminal.path), 500_000)
-    transport = ReconnectingTransport(medium, backoff=FAST, mute_after_s=0.2)
-    transport.open()
-    try:
+def test_a_bus_over_a_port_that_stays_mute_is_opened_again(terminal):
+    with opened(CanMedium("slcan", str(terminal.path), 500_000), mute_after_s=0.2) as transport:
         up(transport, generation=2)
         assert "no frame received for 0.2 s" in transport.last_error
-    finally:
-        transport.close()
-        terminal.remove()
 
 
-@pytest.mark.parametrize(
-    ("error", "expected_text"),
-    [
-        (TypeError("no argument 'hots'"), "link.options do not fit this interface"),
-        (can.CanInterfaceNotImplementedError("only on Windows"), "install its maker's driver"),
-        (NameError("canGetNumberOfChannels"), "install its maker's driver"),
-    ],
-)
-def test_why_an_interface_does_not_open_is_one_line_with_a_remedy(error, expected_text):
-    explanation = CanMedium("kvaser", "0", 500_000).explain(error)
-    assert expected_text in explanation
-    assert "kvaser 0" in explanation
-
-
-@pytest.fixture
-def hub(tmp_path):
-    """A hub in a process of its own; call to start, call the result to stop it."""
-    path = tmp_path / "bus"
-    processes = []
-
-    def start():
-        process = subprocess.Popen([sys.executable, HUB_PROCESS, str(path)], stdout=subprocess.PIPE, text=True)
-        processes.append(process)
+@contextlib.contextmanager
+def hub_process(path):
+    """A hub in a process of its own, which is killed at the end."""
+    process = subprocess.Popen([sys.executable, HUB_PROCESS, path], stdout=subprocess.PIPE, text=True)
+    try:
         assert "ready" in process.stdout.readline()
-        return process
-
-    yield path, start
-    for process in processes:
+        yield
+    finally:
         process.kill()
         process.wait()
         process.stdout.close()
 
 
-def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
-    path, start = hub
-    with closing(opened("unixcan", str(path))) as transport:
+def test_between_processes_through_the_hub_that_dies_and_comes_back(tmp_path):
+    path = str(tmp_path / "bus")
+    with opened_bus("unixcan", path) as transport:
         wait_until(lambda: transport.last_error)
         assert "start the other end first" in transport.last_error
-        process = start()
         for generation in (1, 2):
-            up(transport, generation)
-            with can.Bus(interface="unixcan", channel=str(path), ignore_config=True) as other:
+            with hub_process(path), other_node("unixcan", path) as other:
+                up(transport, generation)
                 before_ns = time.monotonic_ns()
                 other.send(message(0x110, b"\x05"))
                 (received,) = collect(transport, 1)
@@ -420,35 +365,27 @@ def test_between_processes_through_the_hub_that_dies_and_comes_back(hub):
                 assert before_ns - 1_000_000 <= received.t_ns <= time.monotonic_ns()
                 send(transport, outgoing(0x100, b"\x06"))
                 assert bytes(other.recv(5.0).data) == b"\x06"
-            if generation == 1:
-                process.kill()
-                process.wait()
-                wait_until(lambda: transport.state is LinkState.CONNECTING)
-                assert not transport.send(outgoing(), time.monotonic_ns())
-                start()
+            wait_until(lambda: transport.state is LinkState.CONNECTING)
+            assert not transport.send(outgoing(), time.monotonic_ns())
 
 
 @pytest.fixture
-def adapter():
-    """An slcan adapter: the far end of a pseudo-terminal that takes commands and frames as lines."""
-    terminal = PseudoTerminal()
-    transport = opened("slcan", str(terminal.path), bitrate=250_000)
-    wait_until(lambda: terminal.lines and terminal.lines[-1] == b"O")
-    up(transport)
-    yield transport, terminal
-    transport.close()
-    terminal.remove()
+def slcan(terminal):
+    """A bus by an slcan adapter: the far end of the pseudo-terminal takes commands and frames as lines."""
+    with opened_bus("slcan", str(terminal.path), bitrate=250_000) as transport:
+        wait_until(lambda: terminal.lines and terminal.lines[-1] == b"O")
+        up(transport)
+        yield transport
 
 
-def test_slcan_sets_the_bit_rate_and_carries_frames(adapter):
-    transport, terminal = adapter
+def test_slcan_sets_the_bit_rate_and_carries_frames(slcan, terminal):
     assert b"S5" in terminal.lines
     before_ns = time.monotonic_ns()
     terminal.write(b"t11021122\rt0800\r")
-    assert [received.frame for received in collect(transport, 2)] == [Frame(0x110, b"\x11\x22"), Frame(0x080, b"")]
-    assert transport.receive() == ()
+    assert [received.frame for received in collect(slcan, 2)] == [Frame(0x110, b"\x11\x22"), Frame(0x080, b"")]
+    assert slcan.receive() == ()
     assert before_ns < time.monotonic_ns()
-    send(transport, outgoing(0x100, b"\xab\xcd"))
+    send(slcan, outgoing(0x100, b"\xab\xcd"))
     wait_until(lambda: b"t1002ABCD" in terminal.lines)
 
 
@@ -465,64 +402,53 @@ def test_slcan_sets_the_bit_rate_and_carries_frames(adapter):
         b"\x07\r",
     ],
 )
-def test_slcan_survives_a_garbled_line(adapter, garbage):
-    transport, terminal = adapter
+def test_slcan_survives_a_garbled_line(slcan, terminal, garbage):
     terminal.write(garbage)
     if garbage != b"\x07\r":
-        wait_until(lambda: transport.stats.malformed)
+        wait_until(lambda: slcan.stats.malformed)
     terminal.write(b"t11015a\r")
-    assert collect(transport, 1)[-1].frame == Frame(0x110, b"\x5a")
-    assert transport.generation == 1, "a garbled line does not cost the session"
+    assert collect(slcan, 1)[-1].frame == Frame(0x110, b"\x5a")
+    assert slcan.generation == 1, "a garbled line does not cost the session"
 
 
-def test_slcan_that_sends_nothing_but_garbage_is_opened_again(adapter):
-    transport, terminal = adapter
+def test_slcan_that_sends_nothing_but_garbage_is_opened_again(slcan, terminal):
     for _ in range(20 * GARBAGE_LIMIT):
         terminal.write(b"t1\r")
-        if transport.generation > 1:
+        if slcan.generation > 1:
             break
         time.sleep(0.002)
-    up(transport, generation=2)
-    assert transport.stats.malformed >= GARBAGE_LIMIT
+    up(slcan, generation=2)
+    assert slcan.stats.malformed >= GARBAGE_LIMIT
 
 
-def test_slcan_with_good_frames_between_the_garbage_is_kept(adapter):
-    transport, terminal = adapter
+def test_slcan_with_good_frames_between_the_garbage_is_kept(slcan, terminal):
     for number in range(1, GARBAGE_LIMIT + 10):
         terminal.write(b"t1\r")
-        wait_until(lambda: transport.stats.malformed == number)  # noqa: B023
+        wait_until(lambda: slcan.stats.malformed == number)  # noqa: B023
         if number % 10 == 0:
             terminal.write(b"t110101\r")
-            collect(transport, 1)
-    assert transport.generation == 1
+            collect(slcan, 1)
+    assert slcan.generation == 1
 
 
-def test_slcan_adapter_unplugged_and_plugged_in_again_leaks_nothing(adapter):
-    transport, terminal = adapter
+def test_slcan_adapter_unplugged_and_plugged_in_again_leaks_nothing(slcan, terminal):
     descriptors = len(os.listdir("/proc/self/fd"))
     for generation in (2, 3, 4):
         terminal.unplug()
-        wait_until(lambda: transport.state is LinkState.CONNECTING and transport.last_error)
-        wait_until(lambda: "no such device" in transport.last_error)
+        wait_until(lambda: slcan.state is LinkState.CONNECTING and slcan.last_error)
+        wait_until(lambda: "no such device" in slcan.last_error)
         terminal.plug()
-        up(transport, generation)
+        up(slcan, generation)
         terminal.write(b"t110101\r")
-        assert collect(transport, 1)[-1].frame == Frame(0x110, b"\x01")
+        assert collect(slcan, 1)[-1].frame == Frame(0x110, b"\x01")
     wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
 
 
-def test_slcan_adapter_that_reads_nothing_blocks_nobody_and_frames_expire():
-    terminal = PseudoTerminal()
-    transport = opened("slcan", str(terminal.path))
-    try:
-        up(transport)
-        terminal.stop_reading()
-        wait_until(lambda: median_send_s(transport) and transport.stats.expired and transport.stats.transmit_queue_full)
-        assert median_send_s(transport) < WRITE_TIMEOUT_S / 2, "shorter by far than one write that waits for room"
-        assert transport.state is LinkState.UP
-    finally:
-        transport.close()
-        terminal.remove()
+def test_slcan_adapter_that_reads_nothing_blocks_nobody_and_frames_expire(slcan, terminal):
+    terminal.stop_reading()
+    wait_until(lambda: median_send_s(slcan) and slcan.stats.expired and slcan.stats.transmit_queue_full)
+    assert median_send_s(slcan) < WRITE_TIMEOUT_S / 2, "shorter by far than one write that waits for room"
+    assert slcan.state is LinkState.UP
 
 
 @given(age_ns=st.integers(0, 999_000_000), wall_ns=st.integers(1_500_000_000, 4_000_000_000).map(lambda s: s * 10**9))
@@ -567,6 +493,6 @@ def test_an_interface_on_which_sending_would_be_swallowed_is_not_used(tmp_path, 
 
 
 def test_socketcan_says_what_is_missing():
-    with closing(opened("socketcan", "can_absent")) as transport:
+    with opened_bus("socketcan", "can_absent") as transport:
         wait_until(lambda: transport.last_error)
         assert "sudo ip link set can_absent up type can bitrate 500000" in transport.last_error

@@ -9,13 +9,12 @@ import pytest
 
 from drivers.motor import roboclaw_protocol as protocol
 from drivers.motor.roboclaw_protocol import RoboclawExchange, query, setting
-from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport
 from drivers.transport.serial import SerialMedium
 from drivers.types import Frame, LinkState, OutgoingFrame
 from sim.devices.roboclaw import Roboclaw
+from tests.drivers.transport.links import opened, up
 from tests.drivers.waiting import collect, send, wait_until
 
-FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
 ENCODERS, SPEEDS, STATUS = (query(0x80, name) for name in ("encoders", "speeds", "status"))
 STOP = setting(0x80, "duty_m1m2", duty_m1=0, duty_m2=0)
 # Thirty times what a board is given: on a host whose processors are all taken no reply is late here,
@@ -38,8 +37,6 @@ class Line:
         self.path = directory / "tty"
         self._ended = threading.Event()
         self._plug()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
 
     def _plug(self):
         self._master, self._slave = os.openpty()
@@ -47,6 +44,8 @@ class Line:
         self.path.unlink(missing_ok=True)
         self.path.symlink_to(os.ttyname(self._slave))
         os.set_blocking(self._master, False)
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
 
     def replug(self):
         self.close()
@@ -54,8 +53,6 @@ class Line:
         os.close(self._slave)
         self._ended.clear()
         self._plug()
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
 
     def close(self):
         self._ended.set()
@@ -90,12 +87,9 @@ def exchange():
 def transport(line, exchange, monkeypatch):
     # A write that this host cuts short by a pause counts as not taken, and its frame is sent once more.
     monkeypatch.setattr("drivers.transport.serial.WRITE_TIMEOUT_S", 10.0)
-    medium = SerialMedium(str(line.path), 115_200, exchange=exchange)
-    transport = ReconnectingTransport(medium, backoff=FAST, carries_packets=True)
-    transport.open()
-    wait_until(lambda: transport.state is LinkState.UP)
-    yield transport
-    transport.close()
+    with opened(SerialMedium(str(line.path), 115_200, exchange=exchange), carries_packets=True) as transport:
+        up(transport)
+        yield transport
 
 
 def outgoing(*frames, rank=2):

@@ -39,11 +39,19 @@ def test_serial_port(error, expected_text):
         ("slcan", ValueError("Invalid bitrate"), "slcan can0: Invalid bitrate"),
         ("virtual", caused(can.CanOperationError("Cannot"), ValueError("why")), "virtual can0: Cannot (why)"),
         ("virtual", KeyError(), "virtual can0: KeyError"),
+        ("kvaser", TypeError("no argument 'hots'"), "kvaser can0: link.options do not fit this interface"),
+        ("kvaser", can.CanInterfaceNotImplementedError("here"), "kvaser can0: cannot be used here (here); install its"),
+        (
+            "kvaser",
+            NameError("can..."),
+            "kvaser can0: cannot be used here (can...); install its maker's driver, or use",
+        ),
     ],
 )
 def test_can_bus(interface, error, expected_text):
     text = CanMedium(interface, "can0", 250_000).explain(error)
     assert expected_text in text
+    assert "can0" in text
     assert "\n" not in text
 
 

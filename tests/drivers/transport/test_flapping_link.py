@@ -10,7 +10,6 @@ import pytest
 from drivers.transport.can import CanMedium
 from drivers.transport.reconnecting import BackoffPolicy, LinkLostError, ReconnectingTransport
 from drivers.transport.serial import SerialMedium
-from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import wait_until
 
 IMMEDIATELY = BackoffPolicy(first_s=0.0002, longest_s=0.0002, steady_s=10.0)
@@ -40,10 +39,8 @@ class Flapping:
 
 
 @pytest.fixture
-def serial_line():
-    terminal = PseudoTerminal()
-    yield Flapping(SerialMedium(str(terminal.path), 115_200))
-    terminal.remove()
+def serial_line(terminal):
+    return Flapping(SerialMedium(str(terminal.path), 115_200))
 
 
 @pytest.fixture

@@ -1,30 +1,29 @@
+import pytest
+
 from drivers.transport.inprocess import QUEUE_CAPACITY, connect_pair
-from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame, Transport
+from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
 
 FRAME = Frame(0x123, b"\x01\x02")
 
 
-def open_pair():
+@pytest.fixture
+def pair():
     host, robot = connect_pair()
     host.open()
     robot.open()
     return host, robot
 
 
-def test_what_one_end_sends_the_other_receives_with_its_time():
-    host, robot = open_pair()
+def test_what_one_end_sends_the_other_receives_with_its_time_unless_it_is_late(pair):
+    host, robot = pair
+    assert (host.name, robot.name) == ("host", "robot")
     assert host.send(OutgoingFrame(FRAME, 2_000), 1_000)
     assert robot.receive() == (ReceivedFrame(1_000, FRAME),)
     assert robot.receive() == ()
     assert host.receive() == ()
-    assert host.stats.frames_sent == robot.stats.frames_received == 1
-
-
-def test_a_late_frame_is_dropped():
-    host, robot = open_pair()
     assert not host.send(OutgoingFrame(FRAME, 999), 1_000)
     assert robot.receive() == ()
-    assert host.stats.expired == 1
+    assert host.stats.frames_sent == robot.stats.frames_received == host.stats.expired == 1
 
 
 def test_up_only_while_both_ends_are_open():
@@ -40,8 +39,8 @@ def test_up_only_while_both_ends_are_open():
     assert robot.state is LinkState.CLOSED
 
 
-def test_a_pulled_cable_loses_what_was_under_way_and_counts_as_a_new_link():
-    host, robot = open_pair()
+def test_a_pulled_cable_loses_what_was_under_way_and_counts_as_a_new_link(pair):
+    host, robot = pair
     host.send(OutgoingFrame(FRAME, 2), 1)
     host.plug(False)
     assert robot.receive() == ()
@@ -53,16 +52,11 @@ def test_a_pulled_cable_loses_what_was_under_way_and_counts_as_a_new_link():
     assert host.last_error is None
 
 
-def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted():
-    host, robot = open_pair()
+def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(pair):
+    host, robot = pair
     for number in range(QUEUE_CAPACITY + 3):
         host.send(OutgoingFrame(Frame(1, number.to_bytes(4, "little")), 9), 1)
     received = robot.receive()
     assert len(received) == QUEUE_CAPACITY
     assert received[-1].frame.data == (QUEUE_CAPACITY + 2).to_bytes(4, "little")
     assert robot.stats.receive_overflow == 3
-
-
-def test_is_a_transport():
-    end: Transport = connect_pair()[0]
-    assert end.name == "host"

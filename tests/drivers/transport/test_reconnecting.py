@@ -3,7 +3,6 @@
 import queue
 import threading
 import time
-from contextlib import closing
 from types import SimpleNamespace
 
 import pytest
@@ -21,18 +20,17 @@ from drivers.transport.reconnecting import (
     next_delay_s,
 )
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
+from tests.drivers.transport.links import opened
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
 POLICY = BackoffPolicy(first_s=0.1, longest_s=1.0, steady_s=5.0)
 
 
 def test_delays_double_up_to_the_longest():
-    delays = []
-    delay = None
+    delays = [None]
     for _ in range(6):
-        delay = next_delay_s(POLICY, delay, up_for_s=0.0)
-        delays.append(delay)
-    assert delays == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
+        delays.append(next_delay_s(POLICY, delays[-1], up_for_s=0.0))
+    assert delays[1:] == [0.1, 0.2, 0.4, 0.8, 1.0, 1.0]
 
 
 def test_a_steady_link_starts_afresh_and_a_flapping_one_does_not():
@@ -66,19 +64,22 @@ def frame(can_id, number=0, deadline_ns=100):
 
 
 def drain(queue):
-    sent = []
-    while (outgoing := queue.pop()) is not None:
-        sent.append(outgoing)
-    return sent
+    return list(iter(queue.pop, None))
 
 
-@given(st.lists(st.integers(0, 0x7FF), max_size=40))
-def test_lowest_identifier_first_and_equal_ones_as_they_came(can_ids):
+def pairs(frames):
+    """Identifier and number of each frame."""
+    return [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in frames]
+
+
+@given(st.lists(st.tuples(st.integers(0, 0x7FF), st.booleans()), max_size=40))
+def test_what_has_not_expired_is_sent_lowest_identifier_first_and_equal_ones_as_they_came(frames):
     queue = TransmitQueue(64)
-    for number, can_id in enumerate(can_ids):
-        assert queue.push(frame(can_id, number)) is None
-    sent = [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in drain(queue)]
-    assert sent == sorted((can_id, number) for number, can_id in enumerate(can_ids))
+    for number, (can_id, is_expired) in enumerate(frames):
+        assert queue.push(frame(can_id, number, deadline_ns=10 if is_expired else 100)) is None
+    assert queue.expire(50) == sum(is_expired for _, is_expired in frames)
+    kept = [(can_id, number) for number, (can_id, is_expired) in enumerate(frames) if not is_expired]
+    assert pairs(drain(queue)) == sorted(kept)
 
 
 def test_frames_of_one_rank_keep_their_order_and_a_lower_rank_goes_first():
@@ -96,16 +97,6 @@ def test_a_frame_never_outlives_its_deadline():
     assert queue.expire(10) == 0
     assert queue.expire(11) == 1
     assert queue.pop().frame.can_id == 2
-
-
-@given(st.lists(st.tuples(st.integers(0, 20), st.booleans()), max_size=40))
-def test_what_has_not_expired_keeps_its_order(frames):
-    queue = TransmitQueue(64)
-    for number, (can_id, is_expired) in enumerate(frames):
-        queue.push(frame(can_id, number, deadline_ns=10 if is_expired else 100))
-    assert queue.expire(50) == sum(is_expired for _, is_expired in frames)
-    sent = [(outgoing.frame.can_id, outgoing.frame.data[0]) for outgoing in drain(queue)]
-    assert sent == sorted((can_id, number) for number, (can_id, is_expired) in enumerate(frames) if not is_expired)
 
 
 def test_full_queue_refuses_the_least_urgent_frame():
@@ -209,11 +200,17 @@ def medium():
 
 
 @pytest.fixture
-def transport(medium):
+def unopened(medium):
     transport = ReconnectingTransport(medium, backoff=FAST)
     yield transport
     medium.may_write.set()
     transport.close()
+
+
+@pytest.fixture
+def transport(unopened):
+    up(unopened)
+    return unopened
 
 
 def up(transport, generation=1):
@@ -221,31 +218,30 @@ def up(transport, generation=1):
     wait_until(lambda: transport.state is LinkState.UP and transport.generation == generation)
 
 
-def test_carries_frames_both_ways(transport, medium):
-    assert transport.state is LinkState.CLOSED
-    up(transport)
-    send(transport, outgoing(0x101, b"\x07"))
-    wait_until(lambda: medium.sent == [Frame(0x101, b"\x07")])
+def test_carries_frames_both_ways_of_any_identifier_and_length(transport, medium):
+    for frame in (Frame(0x101, b"\x07"), Frame(0, b""), Frame(0x7FF, bytes(8))):
+        send(transport, outgoing(frame.can_id, frame.data))
+        wait_until(lambda: medium.sent and medium.sent[-1] == frame)  # noqa: B023
     frame = ReceivedFrame(5, Frame(0x110, b"\x01\x02"))
     medium.incoming.put([frame, frame])
     assert collect(transport, 2) == [frame, frame]
     assert transport.receive() == ()
-    wait_until(lambda: transport.stats.frames_sent == 1)
+    wait_until(lambda: transport.stats.frames_sent == 3)
     assert transport.stats.frames_received == 2
     assert transport.stats.bytes_received == 4
 
 
-def test_keeps_trying_until_the_device_is_there(transport, medium):
+def test_keeps_trying_until_the_device_is_there(unopened, medium):
+    assert unopened.state is LinkState.CLOSED
     medium.refusals = [OSError("not there"), RuntimeError("odd"), KeyError("odder")]
-    up(transport)
+    up(unopened)
     assert medium.attempts == 4
-    assert transport.last_error is None
-    assert transport.stats.reconnects == 0
+    assert unopened.last_error is None
+    assert unopened.stats.reconnects == 0
 
 
 @pytest.mark.parametrize("error", [OSError("unplugged"), IndexError("bug in a backend"), LinkLostError("bus-off")])
 def test_any_error_while_receiving_is_counted_and_the_link_made_anew(transport, medium, error):
-    up(transport)
     medium.incoming.put(error)
     up(transport, generation=2)
     assert transport.stats.receive_errors == 1
@@ -257,7 +253,6 @@ def test_any_error_while_receiving_is_counted_and_the_link_made_anew(transport, 
 
 def test_an_error_while_sending_makes_the_link_anew(transport, medium):
     """Some backends report a dead line only when sending; receiving would be silent for ever."""
-    up(transport)
     medium.write_error = BrokenPipeError("server gone")
     send(transport, outgoing())
     wait_until(lambda: transport.generation >= 2)
@@ -273,7 +268,7 @@ def test_an_error_while_sending_makes_the_link_anew(transport, medium):
 
 @pytest.mark.parametrize("way", ["read", "write"])
 def test_the_loss_is_reported_in_the_mediums_words(medium, way):
-    with closing(ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=5.0))) as transport:
+    with opened(medium, BackoffPolicy(first_s=5.0)) as transport:
         up(transport)
         if way == "read":
             medium.incoming.put(OSError("unplugged"))
@@ -292,31 +287,19 @@ def test_a_device_that_is_absent_or_flaps_is_tried_less_and_less_often(medium, f
             medium.incoming.put(OSError("gone at once"))
     else:
         medium.refusals = [OSError("not there")] * 10_000
-    transport = ReconnectingTransport(medium, backoff=BackoffPolicy(first_s=0.01, longest_s=10.0, steady_s=5.0))
     started = time.monotonic()
-    transport.open()
-    wait_until(lambda: medium.attempts >= 5)
-    elapsed_s = time.monotonic() - started
-    transport.close()
-    assert elapsed_s >= 0.01 + 0.02 + 0.04 + 0.08
+    with opened(medium, BackoffPolicy(first_s=0.01, longest_s=10.0, steady_s=5.0)):
+        wait_until(lambda: medium.attempts >= 5)
+        assert time.monotonic() - started >= 0.01 + 0.02 + 0.04 + 0.08
 
 
 def test_an_idle_link_costs_nothing(transport):
-    up(transport)
     before_s, cpu_before_s = time.monotonic(), time.process_time()
     time.sleep(0.3)
     assert time.process_time() - cpu_before_s < 0.5 * (time.monotonic() - before_s)
 
 
-@pytest.mark.parametrize("frame", [Frame(0, b""), Frame(0x7FF, bytes(8))])
-def test_the_first_and_the_last_identifier_and_the_longest_frame(transport, medium, frame):
-    up(transport)
-    send(transport, OutgoingFrame(frame, time.monotonic_ns() + 5 * 10**9))
-    wait_until(lambda: medium.sent == [frame])
-
-
 def test_nothing_old_is_sent_on_a_new_link(transport, medium):
-    up(transport)
     medium.may_write.clear()
     send(transport, outgoing(data=b"a"), outgoing(data=b"b"))
     wait_until(transport._writing.locked)
@@ -331,7 +314,6 @@ def test_nothing_old_is_sent_on_a_new_link(transport, medium):
 
 
 def test_frames_received_on_the_old_link_are_not_delivered_on_the_new(transport, medium):
-    up(transport)
     medium.incoming.put([ReceivedFrame(1, Frame(1, b"old"))])
     wait_until(lambda: transport.stats.frames_received == 1)
     medium.incoming.put(OSError("unplugged"))
@@ -339,16 +321,15 @@ def test_frames_received_on_the_old_link_are_not_delivered_on_the_new(transport,
     assert transport.receive() == ()
 
 
-def test_no_sending_while_the_link_is_down(transport, medium):
+def test_no_sending_while_the_link_is_down(unopened, medium):
     medium.refusals = [OSError("not there")] * 100_000
-    transport.open()
-    wait_until(lambda: transport.last_error == "scripted: not there")
-    assert not transport.send(outgoing(), time.monotonic_ns())
-    assert transport.stats.send_errors == 1
+    unopened.open()
+    wait_until(lambda: unopened.last_error == "scripted: not there")
+    assert not unopened.send(outgoing(), time.monotonic_ns())
+    assert unopened.stats.send_errors == 1
 
 
 def test_a_late_frame_is_never_sent(transport, medium):
-    up(transport)
     assert not transport.send(OutgoingFrame(Frame(1, b""), 999), 1_000)
     assert transport.stats.expired == 1
     medium.may_write.clear()
@@ -364,7 +345,6 @@ def test_a_late_frame_is_never_sent(transport, medium):
 
 
 def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fits(transport, medium):
-    up(transport)
     medium.may_write.clear()
     send(transport, outgoing(0x300))
     wait_until(transport._writing.locked)
@@ -379,7 +359,6 @@ def test_a_stalled_medium_never_blocks_the_caller_and_an_emergency_stop_still_fi
 
 
 def test_no_room_on_the_medium_is_counted_once_a_frame_and_tried_again(transport, medium):
-    up(transport)
     medium.write_error = TransmitBusyError("ENOBUFS")
     send(transport, outgoing(0x100, b"kept"))
     wait_until(lambda: transport.stats.transmit_queue_full)
@@ -392,7 +371,6 @@ def test_no_room_on_the_medium_is_counted_once_a_frame_and_tried_again(transport
 
 
 def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(transport, medium):
-    up(transport)
     total = reconnecting.RECEIVE_CAPACITY + 10
     medium.incoming.put([ReceivedFrame(number, Frame(1, b"")) for number in range(total)])
     wait_until(lambda: transport.stats.receive_overflow == 10)
@@ -402,7 +380,6 @@ def test_a_reader_that_falls_behind_gets_the_newest_and_the_loss_is_counted(tran
 
 def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium, monkeypatch):
     monkeypatch.setattr(reconnecting, "_DRAIN_S", 10.0)
-    up(transport)
     frames = [outgoing(0x080, bytes((number,))) for number in range(20)]
     send(transport, *frames)
     transport.close()
@@ -415,14 +392,12 @@ def test_closing_sends_what_is_queued_and_ends_the_threads(transport, medium, mo
 
 
 def test_opening_twice_starts_one_pair_of_threads(transport, medium):
-    up(transport)
     transport.open()
     assert len([thread for thread in threading.enumerate() if thread.name.startswith("scripted")]) == 2
 
 
 @pytest.mark.parametrize("frame", [Frame(0x800, b""), Frame(-1, b""), Frame(1, bytes(9)), Frame(1, b"", extended=True)])
 def test_what_is_no_can_frame_is_the_callers_error(transport, frame):
-    up(transport)
     with pytest.raises(ValueError, match="not a classic CAN frame"):
         transport.send(OutgoingFrame(frame, 10), 1)
 
@@ -447,11 +422,7 @@ def test_a_link_is_left_open_while_frames_come_and_connected_again_when_none_doe
     medium = ScriptedMedium()
     connections = iter((Answering(medium), Silent(medium)))
     medium.connect = lambda _counters: next(connections)
-    transport = ReconnectingTransport(medium, backoff=FAST, mute_after_s=0.5)
-    transport.open()
-    try:
+    with opened(medium, FAST, mute_after_s=0.5) as transport:
         assert second.wait(10.0)
         assert (reads[0], transport.generation) == (46, 2)
         assert "no frame received for 0.5 s" in transport.last_error
-    finally:
-        transport.close()

@@ -4,36 +4,34 @@ import re
 import socket
 import termios
 import time
+from contextlib import closing
+from unittest.mock import Mock
 
 import pytest
 import serial
 
-from drivers.transport.reconnecting import BackoffPolicy, ReconnectingTransport, TransportCounters
+from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import WRITE_TIMEOUT_S, SerialMedium, open_port, request_low_latency
 from drivers.types import Frame, LinkState
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from tests.drivers.transport.links import opened, up
 from tests.drivers.transport.pseudo_terminal import PseudoTerminal
 from tests.drivers.waiting import collect, median_send_s, outgoing, send, wait_until
 
-FAST = BackoffPolicy(first_s=0.01, longest_s=0.05, steady_s=0.1)
 FRAME = Frame(0x110, bytes(range(8)))
 LINE = encode_frame(FRAME.can_id, FRAME.data)
 
 
 @pytest.fixture
-def terminal():
-    terminal = PseudoTerminal()
-    yield terminal
-    terminal.remove()
+def medium(terminal):
+    return SerialMedium(str(terminal.path), 115_200)
 
 
 @pytest.fixture
-def transport(terminal):
-    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST)
-    transport.open()
-    wait_until(lambda: transport.state is LinkState.UP)
-    yield transport
-    transport.close()
+def transport(medium):
+    with opened(medium) as transport:
+        up(transport)
+        yield transport
 
 
 def decoded(terminal):
@@ -78,19 +76,15 @@ def test_garbage_is_counted_and_the_next_frame_is_whole(transport, terminal):
     assert transport.generation == 1
 
 
-def test_half_a_frame_of_an_earlier_program_does_not_spoil_our_first(terminal):
+def test_half_a_frame_of_an_earlier_program_does_not_spoil_our_first(terminal, medium):
     """The receiving end holds what was written before; our first byte on a new line ends it."""
-    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST)
     terminal.received.extend(LINE[:6])
-    transport.open()
-    try:
-        wait_until(lambda: transport.state is LinkState.UP)
+    with opened(medium) as transport:
+        up(transport)
         send(transport, outgoing(0x100, b"\x01"))
         wait_until(lambda: decoded(terminal) == [(0x100, b"\x01")])
         send(transport, outgoing(0x100, b"\x02"))
         wait_until(lambda: terminal.received.endswith(encode_frame(0x100, b"\x01") + encode_frame(0x100, b"\x02")))
-    finally:
-        transport.close()
 
 
 @pytest.mark.parametrize("cut", [0, 1, len(LINE) // 2, len(LINE) - 1])
@@ -125,21 +119,21 @@ def test_a_device_that_reads_nothing_blocks_nobody(transport, terminal):
     wait_until(lambda: decoded(terminal)[-1] == (0x100, b"first after the jam"[:8]))
 
 
-def test_an_adapter_that_comes_back_under_another_number_is_found_by_its_lasting_name(tmp_path):
+def test_an_adapter_that_comes_back_under_another_number_is_found_by_its_lasting_name(terminal, tmp_path):
     """The old number belongs to another device meanwhile, which is open, says nothing, and never fails."""
-    before, after = PseudoTerminal(), PseudoTerminal()
     by_id = tmp_path / "usb-FTDI_A10K3X-if00"
-    by_id.symlink_to(before.path)
-    transport = ReconnectingTransport(SerialMedium(str(by_id), 115_200), backoff=FAST, mute_after_s=0.3)
-    transport.open()
+    by_id.symlink_to(terminal.path)
 
     def frames_from(terminal):
         # Again and again: a host that pauses makes the line mute, and what was on it is gone.
         return wait_until(lambda: terminal.write(LINE) or transport.receive())
 
-    try:
-        wait_until(lambda: transport.state is LinkState.UP)
-        assert frames_from(before)[-1].frame == FRAME
+    with (
+        closing(PseudoTerminal()) as after,
+        opened(SerialMedium(str(by_id), 115_200), mute_after_s=0.3) as transport,
+    ):
+        up(transport)
+        assert frames_from(terminal)[-1].frame == FRAME
         generation = transport.generation
         by_id.unlink()
         by_id.symlink_to(after.path)
@@ -148,24 +142,11 @@ def test_an_adapter_that_comes_back_under_another_number_is_found_by_its_lasting
         assert "/dev/serial/by-id" in transport.last_error
         assert frames_from(after)[-1].frame == FRAME
         wait_until(lambda: transport.last_error is None)
-    finally:
-        transport.close()
-        before.remove()
-        after.remove()
 
 
-def test_bytes_that_are_no_frames_do_not_count_as_an_answer(terminal):
-    transport = ReconnectingTransport(SerialMedium(str(terminal.path), 115_200), backoff=FAST, mute_after_s=0.3)
-    transport.open()
-
-    def reopened():
-        terminal.write(b"$GPGGA,,,\r\n\0")
-        return transport.generation >= 2
-
-    try:
-        wait_until(reopened)
-    finally:
-        transport.close()
+def test_bytes_that_are_no_frames_do_not_count_as_an_answer(terminal, medium):
+    with opened(medium, mute_after_s=0.3) as transport:
+        wait_until(lambda: terminal.write(b"$GPGGA,,,\r\n\0") or transport.generation >= 2)
 
 
 @pytest.mark.parametrize(("dtr", "rts"), [(False, False), (True, False), (False, True)])
@@ -182,7 +163,7 @@ def test_the_lines_are_set_before_the_port_is_opened(terminal, monkeypatch, dtr,
     assert seen == [(dtr, rts, True)]
 
 
-def test_both_lines_are_low_unless_robot_toml_says_otherwise(terminal):
+def test_both_lines_are_low_unless_robot_toml_says_otherwise(medium, monkeypatch):
     """At the seam to the kernel, as pseudo-terminals have no such lines: which are set, and which are cleared."""
     line_states = []
 
@@ -193,35 +174,20 @@ def test_both_lines_are_low_unless_robot_toml_says_otherwise(terminal):
         def _update_rts_state(self):
             line_states.append(("rts", self._rts_state))
 
-    port = SerialMedium(str(terminal.path), 115_200)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(serial, "Serial", Port)
-        port.connect(TransportCounters()).close()
+    monkeypatch.setattr(serial, "Serial", Port)
+    medium.connect(TransportCounters()).close()
     assert set(line_states) == {("dtr", False), ("rts", False)}
 
 
-class FtdiPort:
-    """Stands for an adapter that can hold received bytes back, or for one that says in some way that it cannot."""
-
-    def __init__(self, error=None):
-        self.low_latency = False
-        self.error = error
-
-    def set_low_latency_mode(self, enabled):
-        if self.error is not None:
-            raise self.error
-        self.low_latency = enabled
-
-
 def test_an_adapter_that_holds_bytes_back_is_set_not_to():
-    port = FtdiPort()
+    port = Mock()
     request_low_latency(port)
-    assert port.low_latency
+    port.set_low_latency_mode.assert_called_once_with(True)
 
 
 @pytest.mark.parametrize("error", [ValueError("no such mode"), OSError(25, "ENOTTY"), NotImplementedError("not here")])
 def test_a_port_without_low_latency_is_used_as_it_is(error):
-    request_low_latency(FtdiPort(error))
+    request_low_latency(Mock(set_low_latency_mode=Mock(side_effect=error)))
     request_low_latency(object())
 
 
@@ -257,22 +223,19 @@ def listener(request, tmp_path):
 
 
 def test_a_line_over_a_socket_carries_frames_both_ways_and_comes_back(listener):
-    transport = ReconnectingTransport(SerialMedium(listener.url, 115_200), backoff=FAST)
-    transport.open()
-    try:
+    with opened(SerialMedium(listener.url, 115_200)) as transport:
         for generation in (1, 2):
             listener.accept()
-            wait_until(lambda: transport.state is LinkState.UP and transport.generation == generation)  # noqa: B023
+            up(transport, generation)
             listener.peer.sendall(LINE[:5])
             time.sleep(0.002)
             listener.peer.sendall(LINE[5:] + LINE)
             assert [received.frame for received in collect(transport, 2)] == [FRAME, FRAME]
             send(transport, outgoing(0x100, b"\x02"))
             wait_until(lambda: listener.received() == [(0x100, b"\x02")])
+            assert transport.generation == generation
             listener.peer.close()
         assert transport.stats.malformed == 0
-    finally:
-        transport.close()
 
 
 def test_what_waits_on_a_socket_is_read_at_once(listener):

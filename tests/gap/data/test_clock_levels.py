@@ -22,9 +22,7 @@ from disco_hw.gap.data.stamp_clock import _level, _line
 def test_a_level_is_that_of_most(delays, squares, level):
     for turned in (1.0, -1.0):
         assert _level(turned * np.array(delays), 0.1) == pytest.approx((squares, turned * level), abs=1e-12)
-
-
-def test_without_a_bound_the_level_is_the_median_and_squares_are_about_the_mean():
+    # Without a bound it is the median.
     assert _level(np.array([1.0, 2.0, 6.0]), np.inf) == pytest.approx((14.0, 2.0))
 
 
@@ -37,22 +35,17 @@ def test_a_line_is_that_of_most(slope):
     assert _line(np.array([0.0, 1.0, 5.0]), np.array([0.0, slope, 9.0]), 0.1)[1] == pytest.approx(slope)
 
 
-def test_a_line_is_fitted_to_those_that_are_not_just_as_far_off_as_counts():
-    delays = np.zeros(9)
-    delays[4] = 0.25
-    assert _line(np.arange(9.0), delays, 0.25) == pytest.approx((0.25**2, 0.0), abs=1e-12)
-
-
 @pytest.mark.parametrize(
-    ("off", "squares", "slope"),
-    [([0.0, 0.0, 0.0, 0.0, 0.0, 0.3], 0.01, 0.1),
-     ([0.0, 0.06, 0.0, 0.0, -0.06, 0.0], 0.0072 - 0.18**2 / 17.5, 0.1 - 0.18 / 17.5)],
-)  # fmt: skip
-def test_one_that_is_far_off_does_not_turn_a_line_and_two_that_are_little_do(off, squares, slope):
-    x = np.arange(6.0)
-    assert _line(x, 0.1 * x + np.array(off), 0.1) == pytest.approx((squares, slope))
-
-
-def test_four_that_are_nearly_on_a_line_are_more_than_three_that_are():
-    delays = np.array([0.0, -1.0, -2.0, 5.0, 5.05, 5.05, 5.0])
-    assert _line(np.arange(7.0), delays, 0.1) == pytest.approx((0.0325, 0.0), abs=1e-9)
+    ("delays", "bound", "squares", "slope"),
+    [
+        # It is fitted to those that are not just as far off as counts.
+        ([0.0, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.0], 0.25, 0.25**2, 0.0),
+        # One that is far off does not turn it, and two that are little do.
+        ([0.0, 0.1, 0.2, 0.3, 0.4, 0.8], 0.1, 0.01, 0.1),
+        ([0.0, 0.16, 0.2, 0.3, 0.34, 0.5], 0.1, 0.0072 - 0.18**2 / 17.5, 0.1 - 0.18 / 17.5),
+        # Four that are nearly on a line are more than three that are.
+        ([0.0, -1.0, -2.0, 5.0, 5.05, 5.05, 5.0], 0.1, 0.0325, 0.0),
+    ],
+)
+def test_a_line_of_even_stretches_is_that_of_those_that_lie_near_it(delays, bound, squares, slope):
+    assert _line(np.arange(float(len(delays))), np.array(delays), bound) == pytest.approx((squares, slope), abs=1e-9)

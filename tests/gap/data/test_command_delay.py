@@ -118,20 +118,17 @@ def test_what_wheels_turn_is_fitted_by_what_both_commands_make_them_turn(delay_s
 
 
 def test_a_pair_is_known_from_the_first_command_to_the_last_and_up_to_one_that_is_not_known():
-    commands = commands_at([1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [(1, 2), (3, 1), (2, 2), (np.nan, np.nan), (4, 4), (1, 0)])
-    for begin_s, end_s, known in (
-        (1.0, 2.0, True), (0.99, 2.0, False), (2.5, 4.0, True), (2.5, 4.01, False), (4.99, 5.5, False),
-        (5.0, 6.0, True), (5.5, 6.01, False),
-    ):  # fmt: skip
-        pair = Turned(*(np.array([each]) for each in (begin_s, end_s, 0, 1.0, 1.0)))
-        assert WheelResponse.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
+    def known(t_s, unknown, *pairs):
+        asked = np.random.default_rng(0).normal(0.0, 3.0, (len(t_s), 2))
+        asked[unknown] = np.nan
+        turned = Turned(*np.transpose(pairs), np.zeros(len(pairs), np.int64), *np.ones((2, len(pairs))))
+        return WheelResponse.of(commands_at(t_s, asked), 0.0).known(turned, 0.0).tolist()
 
-
-def test_what_was_not_known_right_after_the_first_command_is_not_known():
-    commands = commands_at([1.0, 2.0, 2.25, 3.0], [(1, 2), (np.nan, np.nan), (2, 2), (4, 4)])
-    for begin_s, end_s, known in ((1.5, 2.0, True), (1.5, 2.125, False), (1.5, 2.5, False), (2.25, 2.5, True)):
-        pair = Turned(*(np.array([each]) for each in (begin_s, end_s, 0, 1.0, 1.0)))
-        assert WheelResponse.of(commands, 0.0).known(pair, 0.0).tolist() == [known]
+    assert known(range(1, 7), 3, (1.0, 2.0), (2.5, 4.0), (5.0, 6.0)) == [True] * 3
+    assert known(range(1, 7), 3, (0.99, 2.0), (2.5, 4.01), (4.99, 5.5), (5.5, 6.01)) == [False] * 4
+    # Right after the first command.
+    assert known([1.0, 2.0, 2.25, 3.0], 1, (1.5, 2.0), (2.25, 2.5)) == [True] * 2
+    assert known([1.0, 2.0, 2.25, 3.0], 1, (1.5, 2.125), (1.5, 2.5)) == [False] * 2
 
 
 def sampled(count=400, period_s=0.05, segment=0):

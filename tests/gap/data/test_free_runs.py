@@ -8,6 +8,7 @@ from disco_hw.gap.data.free_runs import pose_residual, run_body, run_wheels
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
+from tests.gap.synthetic import vector_of
 from tests.tables import thinned
 from tools.compile_kernels import model_with_every_effect
 
@@ -47,14 +48,19 @@ def test_two_channels_in_a_row_are_the_model(effects):
     np.testing.assert_allclose(track, states[:, :3], atol=2e-3)
 
 
+def turned(commands, first=None, moved_s=0.0, measured_rad_s=None, **effects):
+    """Angles (M, 2) of wheels that answer commands by these first parameters of effects."""
+    count, still = len(commands), np.zeros(commands.shape)
+    return run_wheels(
+        vector_of(WHEEL, **effects), np.array(BASE), commands, still, np.arange(count) == 0 if first is None else first,
+        np.arange(count) * GRID_STEP_S, still if measured_rad_s is None else measured_rad_s, moved_s,
+    )  # fmt: skip
+
+
 def test_a_command_that_is_not_known_stops_the_prediction():
     commands = np.full((100, 2), 2.0)
     commands[40:60] = np.nan
-    first = np.arange(100) == 0
-    angle = run_wheels(
-        WHEEL.neutral, np.array([0.06, 0.4, 0.0]), commands, np.zeros((100, 2)), first, np.arange(100) * GRID_STEP_S,
-        np.zeros((100, 2)),
-    )  # fmt: skip
+    angle = turned(commands)
     assert np.all(np.isfinite(angle))
     assert angle[60, 0] == angle[41, 0]
     assert angle[99, 0] > angle[60, 0] + 0.5
@@ -65,11 +71,7 @@ def test_commands_that_are_moved_do_not_look_into_another_run(late_s):
     # Two runs, the first at 2 rad/s, the second at -3: whichever way they are moved, each keeps its own commands.
     first = np.isin(np.arange(100), (0, 50))
     commands = np.repeat([[2.0, 2.0], [-3.0, -3.0]], 50, axis=0)
-    p = WHEEL.neutral.copy()
-    p[WHEEL.place["command_delay.delay_s"]] = late_s
-    angle = run_wheels(
-        p, np.array([0.06, 0.4, 0.0]), commands, np.zeros((100, 2)), first, np.arange(100) * GRID_STEP_S, commands
-    )
+    angle = turned(commands, first, measured_rad_s=commands, command_delay=late_s)
     along = np.arange(50) * GRID_STEP_S
     np.testing.assert_allclose(angle[:, 0], np.concatenate([2.0 * along, -3.0 * along]), atol=1e-9)
 
@@ -106,7 +108,6 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
     )
     moving_s = np.minimum(t_s, 15.0) + 0.5 * np.maximum(t_s - 15.0, 0.0)
     node = np.arange(100, 2900, 4)
-    p = BODY.neutral.copy()
     drift = (0.05, -0.03)
     then = t_s[node] - late_s
     # What the sensor reports at a stamp is where the robot was that long before.
@@ -115,10 +116,8 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
     measured[:, :2] += np.interp(then, t_s, moving_s)[:, None] * drift
 
     def residual(latency_s, laid=node, moved_s=0.0):
-        q = p.copy()
-        q[BODY.place["pose_latency.latency_s"]] = latency_s
         return pose_residual(
-            q, track, ground, laid, np.zeros(node.size), np.arange(node.size) // 100,
+            vector_of(pose_latency=latency_s), track, ground, laid, np.zeros(node.size), np.arange(node.size) // 100,
             np.zeros(node.size, dtype=np.int64), np.full(node.size, 2999), np.ones(node.size, dtype=bool), measured,
             moved_s,
         )  # fmt: skip
@@ -134,31 +133,20 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
 def test_a_limit_that_nothing_comes_near_runs_as_one_that_is_not_there():
     t_s = np.arange(N) * GRID_STEP_S
     commands = np.column_stack([4 * np.sin(0.8 * t_s), 6 * np.sign(np.sin(0.5 * t_s)) + 1])
-    columns = ("turning_buildup.limit_rad_s2", "yaw_acceleration_limit.limit_rad_s2")
-
-    def turned(limit):
-        p = WHEEL.neutral.copy()
-        p[WHEEL.place["motor_lag.tau_s"]] = 0.1
-        for column in columns:
-            p[WHEEL.place[column]] = limit
-        geometry, still = np.array(BASE), np.zeros((N, 2))
-        return run_wheels(p, geometry, commands, still, t_s == 0.0, t_s, still)
-
-    absent = turned(WHEEL.neutral[WHEEL.place[columns[0]]])
-    np.testing.assert_allclose(turned(1e5), absent, atol=1e-7)
-    assert np.abs(turned(1.0) - absent).max() > 0.1
+    absent, far, near = (
+        turned(commands, motor_lag=0.1, **limits)
+        for limits in ({}, *(dict.fromkeys(("turning_buildup", "yaw_acceleration_limit"), at) for at in (1e5, 1.0)))
+    )
+    np.testing.assert_allclose(far, absent, atol=1e-7)
+    assert np.abs(near - absent).max() > 0.1
 
 
 @pytest.mark.parametrize("moved_s", [-0.3, 0.12])
 def test_commands_that_lie_later_than_they_are_stamped_are_as_much_less_late(moved_s):
     t_s = np.arange(N) * GRID_STEP_S
     commands = np.column_stack([4 * np.sin(0.8 * t_s), 6 * np.sign(np.sin(0.5 * t_s)) + 1])
-    cells = round(moved_s / GRID_STEP_S)
-    p, less = WHEEL.neutral.copy(), WHEEL.neutral.copy()
-    p[WHEEL.place["command_delay.delay_s"]], less[WHEEL.place["command_delay.delay_s"]] = 0.2, 0.2 - moved_s
-    still, laid = np.zeros((N, 2)), np.roll(commands, cells, axis=0)
-    stamped = run_wheels(p, np.array(BASE), commands, still, t_s == 0.0, t_s, still)
-    moved = run_wheels(p, np.array(BASE), laid, still, t_s == 0.0, t_s, still, moved_s)
+    laid = np.roll(commands, round(moved_s / GRID_STEP_S), axis=0)
+    stamped, moved = turned(commands, command_delay=0.2), turned(laid, moved_s=moved_s, command_delay=0.2)
     inside = slice(100, -100)
     np.testing.assert_allclose(np.diff(moved, axis=0)[inside], np.diff(stamped, axis=0)[inside], atol=1e-9)
-    np.testing.assert_array_equal(moved, run_wheels(less, np.array(BASE), laid, still, t_s == 0.0, t_s, still))
+    np.testing.assert_array_equal(moved, turned(laid, command_delay=0.2 - moved_s))

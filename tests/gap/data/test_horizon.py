@@ -8,6 +8,7 @@ import pytest
 from disco_hw.gap.data import BODY, carried
 from disco_hw.gap.data.free_runs import displacement, starts_as_far_as, starts_of
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
+from tests.gap.synthetic import vector_of
 
 N = 1000
 ONE_RUN = np.arange(N) == 0
@@ -25,8 +26,7 @@ def test_a_circle_looks_the_same_from_everywhere():
 def test_latency_shows_what_was_and_drift_adds_in_the_world():
     t = np.arange(N) * GRID_STEP_S
     track = np.column_stack([0.5 * t**2, np.zeros(N), np.zeros(N)])
-    late = BODY.neutral.copy()
-    late[BODY.place["pose_latency.latency_s"]] = 0.1
+    late = vector_of(pose_latency=0.1)
     start = np.array([300])
     sooner, later = (
         displacement(p, ONE_RUN, track, STILL, start, np.zeros(1), 1.0)[0, 0] for p in (BODY.neutral, late)
@@ -35,22 +35,18 @@ def test_latency_shows_what_was_and_drift_adds_in_the_world():
     laid = displacement(late, ONE_RUN, track, STILL, start, np.zeros(1), 1.0, 0.1)[0, 0]
     assert laid == pytest.approx(sooner, abs=1e-9)
     ground = np.column_stack([np.zeros(N), 0.02 * t])
-    moved = (
-        displacement(BODY.neutral, ONE_RUN, track, ground, start, np.full(1, np.pi / 2), 1.0)[0]
-        - displacement(BODY.neutral, ONE_RUN, track, STILL, start, np.full(1, np.pi / 2), 1.0)[0]
+    carried_there, plain = (
+        displacement(BODY.neutral, ONE_RUN, track, on, start, np.full(1, np.pi / 2), 1.0)[0] for on in (ground, STILL)
     )
-    np.testing.assert_allclose(moved, [0.02, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(carried_there - plain, [0.02, 0.0, 0.0], atol=1e-9)
 
 
 def test_a_slope_carries_a_robot_while_its_wheels_turn_and_a_slide_as_far_as_it_turns():
     speed = np.concatenate([np.zeros((500, 2)), np.full((200, 2), 5.0), np.tile([-5.0, 5.0], (300, 1))])
     t_s = np.arange(N) * GRID_STEP_S
-    p = BODY.neutral.copy()
-    np.testing.assert_array_equal(carried(p, speed, t_s), STILL)
-    p[BODY.place["slope.drift_x_m_s"]], p[BODY.place["slope.drift_y_m_s"]] = 0.02, -0.01
-    p[BODY.place["downhill_slide.slide_y_m"]] = 0.1
-    p[BODY.place["wheel_radius_m"]], p[BODY.place["axial_distance_m"]] = 0.1, 0.5
-    ground = carried(p, speed, t_s)
+    np.testing.assert_array_equal(carried(BODY.neutral, speed, t_s), STILL)
+    sloping = {"slope__drift_x_m_s": 0.02, "slope__drift_y_m_s": -0.01, "downhill_slide__slide_y_m": 0.1}
+    ground = carried(vector_of(wheel_radius_m=0.1, axial_distance_m=0.5, **sloping), speed, t_s)
     np.testing.assert_array_equal(ground[499], [0.0, 0.0])
     straight_s, turning_s = 200 * GRID_STEP_S, 300 * GRID_STEP_S
     np.testing.assert_allclose(ground[699], [0.02 * straight_s, -0.01 * straight_s], rtol=1e-9)
@@ -65,11 +61,9 @@ def test_a_latency_does_not_look_into_another_run(latency_s):
     first = np.arange(N) % 250 == 0
     track = np.column_stack([0.005 * (np.arange(N) % 250), np.zeros(N), np.zeros(N)])
     track[250:500, 0] *= -1.0
-    shifted = BODY.neutral.copy()
-    shifted[BODY.place["pose_latency.latency_s"]] = latency_s
     start = starts_of(first, np.ones(N, bool), 1.0, replace(DEFAULT_SETTINGS.grid, start_every_s=0.01))
     assert start.max() + 102 == N
-    moved = displacement(shifted, first, track, STILL, start, np.zeros(start.size), 1.0)[:, 0]
+    moved = displacement(vector_of(pose_latency=latency_s), first, track, STILL, start, np.zeros(start.size), 1.0)[:, 0]
     # Before a run begins nothing is known: a pose that is so late sees the robot stand.
     expected = 0.5 - 0.5 * np.maximum(latency_s - (start % 250) * GRID_STEP_S, 0.0)
     expected[start // 250 == 1] *= -1.0

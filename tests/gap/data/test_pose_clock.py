@@ -124,6 +124,8 @@ def test_delays_of_two_sizes_are_a_jump_between_two_stretches(seen):
     # Of the early ones there are two at least, and of the late ones.
     assert seen([0.3, 0.3, 0.1, 0.1, 0.1, 0.1]).jump_at_s == pytest.approx(140.0)
     assert seen([0.3, 0.3, 0.3, 0.3, 0.1, 0.1]).jump_at_s == pytest.approx(180.0)
+    # One stretch alone is no side of a jump.
+    assert seen([0.6, 0.1, 0.1, 0.1, 0.1, 0.1]) == seen([0.3, 0.3, 0.3, 0.3, 0.3, 0.1]) == StampClock(0.2)
 
 
 @pytest.mark.parametrize(
@@ -133,10 +135,6 @@ def test_delays_of_two_sizes_are_a_jump_between_two_stretches(seen):
 def test_a_jump_is_where_it_leaves_the_least_squares_on_both_sides(seen, delays, after):
     assert seen(delays).jump_at_s == pytest.approx(100.0 + 120.0 * after / 7.0)
     assert seen(delays[::-1]).jump_at_s == pytest.approx(100.0 + 120.0 * (7 - after) / 7.0)
-
-
-def test_one_stretch_alone_is_no_side_of_a_jump(seen):
-    assert seen([0.6, 0.1, 0.1, 0.1, 0.1, 0.1]) == seen([0.3, 0.3, 0.3, 0.3, 0.3, 0.1]) == StampClock(0.2)
 
 
 def test_a_clock_is_believed_from_four_stretches_on_that_agree_and_where_it_matters(seen):
@@ -296,9 +294,7 @@ def test_a_delay_is_told_where_it_stands_out_and_between_those_that_are_tried(mo
     monkeypatch.setattr(timing, "_mismatches", lambda wheels, poses, delays, settings: np.full(delays.size, np.inf))
     assert pose_delay_s(None, None, SETTINGS) == 0.0
     assert timing._mismatch_at(None, None, 0.1, SETTINGS) == 0.0
-
-
-def test_a_delay_that_stands_out_by_just_enough_is_told(monkeypatch):
+    # By just enough.
     settings = replace(SETTINGS, least_delay_nats=0.5)
     monkeypatch.setattr(
         timing, "_mismatches", lambda wheels, poses, delays, settings: -0.5 * (np.abs(delays - 0.2) < 0.01)

@@ -1,5 +1,7 @@
 """Held wheel speeds are taken once, when they were new, and laid on the time before."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from disco_hw.gap.data.gridded_drive import undo_sample_hold
@@ -34,20 +36,12 @@ def test_measured_angles_and_fresh_speeds_stay():
     speed = np.cos(t)
     wheels = Wheels(t, np.sin(t), np.sin(t), speed, speed, np.zeros(200, np.int64), False, True)
     assert undo_sample_hold(wheels, DEFAULT_SETTINGS.grid) is wheels
-    _, _, held = held_log()
-    measured = Wheels(
-        held.t_s, held.left_angle_rad, held.right_angle_rad, held.left_speed_rad_s, held.right_speed_rad_s,
-        held.segment, True, True,
-    )  # fmt: skip
+    measured = replace(held_log()[2], angle_measured=True)
     assert undo_sample_hold(measured, DEFAULT_SETTINGS.grid) is measured
 
 
 def test_nothing_is_integrated_across_a_change_of_segment():
     t, _, wheels = held_log()
     segment = (t > 10.0).astype(np.int64)
-    jumped = Wheels(
-        t + 50.0 * segment, wheels.left_angle_rad, wheels.right_angle_rad, wheels.left_speed_rad_s,
-        wheels.right_speed_rad_s, segment, False, True,
-    )  # fmt: skip
-    fresh = undo_sample_hold(jumped, DEFAULT_SETTINGS.grid)
+    fresh = undo_sample_hold(replace(wheels, t_s=t + 50.0 * segment, segment=segment), DEFAULT_SETTINGS.grid)
     assert np.abs(np.diff(fresh.left_angle_rad)).max() < 1.0

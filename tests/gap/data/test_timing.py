@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 from disco_hw.gap.data import timing
 from disco_hw.gap.data.command_timing import Turned, command_clock, response
 from disco_hw.gap.data.gridded_drive import grid_drive
+from disco_hw.gap.data.stamp_clock import picked
 from disco_hw.gap.data.timing import pose_clock, pose_delay_s
 from disco_hw.gap.settings import GridSettings
 from disco_hw.log.drive import Commands, Poses, Wheels
@@ -22,11 +23,6 @@ RADIUS_M, TRACK_M = 0.11, 0.6
 def older_by(poses, by_s):
     """Poses whose stamps come `by_s(t)` later still."""
     return replace(poses, t_s=poses.t_s + by_s(poses.t_s))
-
-
-def later(wheels, poses, by_s):
-    """The same drive, begun so much later."""
-    return replace(wheels, t_s=wheels.t_s + by_s), replace(poses, t_s=poses.t_s + by_s)
 
 
 def drive(older_s, turning=True, segments=1, noise_m=0.003, seed=0):
@@ -62,38 +58,37 @@ def test_it_is_found_over_segments_and_beside_poses_that_jump():
     assert found == pytest.approx(0.25, abs=0.005)
 
 
-def test_a_steady_circle_has_no_delay_that_stands_out():
+def test_a_steady_circle_and_too_few_poses_have_no_delay_that_stands_out():
     assert pose_delay_s(*drive(0.4, turning=False), GridSettings()) == 0.0
-
-
-def test_too_few_poses_have_none():
     wheels, poses = drive(0.4)
-    few = Poses(poses.t_s[:50], poses.x_m[:50], poses.y_m[:50], poses.yaw_rad[:50], poses.segment[:50])
-    assert pose_delay_s(wheels, few, GridSettings()) == 0.0
+    assert pose_delay_s(wheels, picked(poses, np.arange(50)), GridSettings()) == 0.0
 
 
 def test_a_clock_that_drifts_is_made_even_and_said_to_drift():
-    wheels, poses = later(*drive(0.1), 400.0)
-    clock = pose_clock(wheels, older_by(poses, lambda t: 0.12 * (t - 430.0) / 60.0), GridSettings())
+    wheels, poses = drive(0.1)
+    # As late in a long log.
+    wheels, poses = (replace(part, t_s=part.t_s + 400.0) for part in (wheels, poses))
+    drifting = older_by(poses, lambda t: 0.12 * (t - 430.0) / 60.0)
+    clock = pose_clock(wheels, drifting, GridSettings())
     drift_s = clock.drift_s / clock.span_s
     assert drift_s == pytest.approx(0.12 / 60.0, rel=0.1)
     assert clock.delay_s == pytest.approx(0.1, abs=0.01)
     (said,) = clock.notes("poses'")
     assert "drifts" in said
-    even = clock.corrected(older_by(poses, lambda t: 0.12 * (t - 430.0) / 60.0))
-    assert np.abs(even.t_s - poses.t_s).max() < 0.01
+    assert np.abs(clock.corrected(drifting).t_s - poses.t_s).max() < 0.01
 
 
 @pytest.mark.parametrize("jump_s", [-0.3, 0.15])
 def test_a_clock_that_jumps_is_made_even_and_said_to_jump(jump_s):
     wheels, poses = drive(0.2)
-    clock = pose_clock(wheels, older_by(poses, lambda t: jump_s * (t > 33.0)), GridSettings())
+    jumping = older_by(poses, lambda t: jump_s * (t > 33.0))
+    clock = pose_clock(wheels, jumping, GridSettings())
     assert clock.jump_s == pytest.approx(jump_s, abs=0.02)
     assert clock.jump_at_s == pytest.approx(33.0, abs=2.0)
     # Half of a jump before it and half of it after: the delay is that of the middle.
     assert clock.delay_s == pytest.approx(0.2 + 0.5 * jump_s, abs=0.01)
     assert "jumps" in clock.notes("poses'")[0]
-    assert (np.diff(clock.corrected(older_by(poses, lambda t: jump_s * (t > 33.0))).t_s) > 0.0).all()
+    assert (np.diff(clock.corrected(jumping).t_s) > 0.0).all()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -127,19 +122,12 @@ def test_a_regression_by_normal_equations_fits_as_one_by_decomposition(alike, sc
     assert timing.mismatch_of(difference, total, measured + 0.1 * total**2) > found + 0.1
 
 
-def test_wheels_that_do_not_turn_leave_all_that_is_measured():
-    nothing, measured = np.zeros(100), np.random.default_rng(6).normal(0.0, 0.1, 100)
-    assert timing.mismatch_of(nothing, nothing, measured) == pytest.approx(
-        of_regression(np.column_stack([nothing, nothing]), measured)
-    )
-
-
-def test_wheels_that_only_turn_alike_or_against_each_other_tell_all_that_they_do():
+def test_wheels_that_only_turn_alike_or_against_each_other_or_not_at_all_tell_all_that_they_do():
     nothing, turned, noise = np.random.default_rng(8).normal(0.0, 0.1, (3, 100)) * [[0.0], [1.0], [0.1]]
     measured = 2.0 * turned + noise
-    expected = of_regression(np.column_stack([nothing, turned]), measured)
-    assert timing.mismatch_of(nothing, turned, measured) == pytest.approx(expected)
-    assert timing.mismatch_of(turned, nothing, measured) == pytest.approx(expected)
+    for difference, total in ((nothing, turned), (turned, nothing), (nothing, nothing)):
+        expected = of_regression(np.column_stack([difference, total]), measured)
+        assert timing.mismatch_of(difference, total, measured) == pytest.approx(expected)
 
 
 # As many pairs as tell a delay to 20 ms.
@@ -249,11 +237,7 @@ def test_unequal_wheels_and_commands_that_are_not_known_do_not_move_it():
 @pytest.mark.filterwarnings("error")
 def test_commands_that_begin_long_after_the_wheels_are_followed_from_there():
     wheels, commands = commanded(0.3, 0.02)
-    late = commands.t_s > 30.0
-    begun = Commands(
-        *(each[late] for each in (commands.t_s, commands.left_rad_s, commands.right_rad_s, commands.segment))
-    )
-    assert answered(wheels, begun).delay_s == pytest.approx(0.3, abs=0.02)
+    assert answered(wheels, picked(commands, commands.t_s > 30.0)).delay_s == pytest.approx(0.3, abs=0.02)
 
 
 def test_a_steady_command_has_no_delay_that_stands_out():
@@ -266,9 +250,5 @@ def test_a_steady_command_has_no_delay_that_stands_out():
 
 def test_speeds_that_come_less_often_than_they_are_compared_show_it_too():
     wheels, commands = commanded(0.3, 0.1)
-    thin = slice(0, None, 30)
-    held = Wheels(
-        wheels.t_s[thin], wheels.left_angle_rad[thin], wheels.right_angle_rad[thin], wheels.left_speed_rad_s[thin],
-        wheels.right_speed_rad_s[thin], wheels.segment[thin], False, True,
-    )  # fmt: skip
+    held = replace(picked(wheels, np.arange(0, wheels.t_s.size, 30)), angle_measured=False)
     assert answered(held, commands).delay_s == pytest.approx(0.3, abs=0.04)

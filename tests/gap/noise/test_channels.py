@@ -5,18 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.data.stamp_clock import picked
 from disco_hw.gap.noise.channels import BodyChannel
-from tests.gap.synthetic import NOISE, line_of, vector_of
+from tests.gap.synthetic import NOISE, line_of, poses_of, vector_of
 
 
 @pytest.mark.parametrize("nominal", [1.0, 0.8, 1.3])
 def test_more_than_half_a_turn_while_no_pose_comes_is_the_turn_of_the_wheels(nominal):
     truth = vector_of()
     line = line_of(np.tile((-6.5, 6.5), (600, 1)))
-    clean = np.empty((line.pose.t_s.size, 3))
-    read_angles(BodyChannel.build(line, NOISE, truth).track(truth), line.pose.node, line.pose.fraction, clean)
+    clean = poses_of(line, truth)
     there = (line.pose.t_s < 1.0) | (line.pose.t_s > 2.8)
     assert np.diff(clean[there, 2]).max() > np.pi
     yaw = np.unwrap(np.angle(np.exp(1j * clean[there, 2])))

@@ -22,7 +22,6 @@ from disco_hw.gap.report.blind_spots import (
     with_effect,
     with_size,
 )
-from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.richest_model import candidates_of
 from tests.gap.synthetic import LIMITS, body_channel, line_of, searched, selector_of, wheels_on
 from tests.tables import thinned
@@ -248,9 +247,8 @@ def test_where_nobody_says_how_many_processors_there_are_no_process_is_copied(mo
         assert [one.unit for one in all_judged()] == [str(os.getpid())] * 5
 
 
-def spots_of(channel, names=(), limits=None):
-    selector = selector_of(channel, limits or LIMITS)
-    return {spot.name: spot for spot in blind_spots(ChannelResult(selector, names, channel))}
+def spots_of(channel, names=(), limits=LIMITS, top_rad_s=None):
+    return {spot.name: spot for spot in blind_spots(searched(channel, names, limits), top_rad_s)}
 
 
 def test_every_effect_that_was_not_found_is_listed_with_the_drive_that_shows_it():
@@ -292,8 +290,7 @@ def test_a_drive_that_only_goes_straight_is_blind_to_slip_in_turns():
 def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn():
     def spot_at(*commands):
         channel = wheels_on(line_of(np.repeat(commands, 200, axis=0)))
-        found = searched(channel)
-        return {spot.name: spot for spot in blind_spots(found, 8.0)}["yaw_acceleration_limit"]
+        return spots_of(channel, top_rad_s=8.0)["yaw_acceleration_limit"]
 
     straight = spot_at(*[(0.0, 0.0), (5.0, 5.0), (-5.0, -5.0)] * 4)
     assert straight.smallest_visible is None
@@ -307,9 +304,7 @@ def test_how_fast_turning_speeds_up_shows_only_where_the_robot_is_asked_to_turn(
 
 def test_no_limit_shows_above_what_was_asked_of_the_robot():
     def spots_at(left, right, top_rad_s):
-        channel = wheels_on(line_of(np.full((4000, 2), (left, right))))
-        found = searched(channel)
-        return {spot.name: spot for spot in blind_spots(found, top_rad_s)}
+        return spots_of(wheels_on(line_of(np.full((4000, 2), (left, right)))), top_rad_s=top_rad_s)
 
     # A steady circle at half speed: 0.3 rad/s of turning.
     slow = spots_at(3.0, 5.0, 10.0)
@@ -328,8 +323,6 @@ def test_no_limit_shows_above_what_was_asked_of_the_robot():
 @thinned("top_rad_s", [0.5, 2.0, 5.0, 8.0, 50.0, None], quick=2)
 def test_whether_a_drive_is_blind_is_a_plain_truth_value_however_slowly_the_robot_turns(top_rad_s):
     for speeds in ((0.0, 0.0), (4.0, 4.0), (-1.5, 1.5), (-40.0, 40.0)):
-        channel = wheels_on(line_of(np.full((4000, 2), speeds)))
-        found = searched(channel)
-        for spot in blind_spots(found, top_rad_s):
+        for spot in spots_of(wheels_on(line_of(np.full((4000, 2), speeds))), top_rad_s=top_rad_s).values():
             assert type(spot.blind) is bool, spot.name
             assert spot.smallest_visible is None or type(spot.smallest_visible) is float, spot.name

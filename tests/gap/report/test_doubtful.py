@@ -61,10 +61,8 @@ def test_only_what_is_known_and_not_contradicted_is_told(name, values, why):
 def test_a_moment_beyond_a_limit_contradicts_nothing():
     speed = np.full((4000, 2), 3.0)
     speed[1000:1004] = 6.0
-    assert (
-        low_confidence_of(effect("speed_limit", limit_rad_s=(3.2, 3.1, 3.3)), Measured(line_of(speed), GEOMETRY))
-        is None
-    )
+    limit = effect("speed_limit", limit_rad_s=(3.2, 3.1, 3.3))
+    assert low_confidence_of(limit, Measured(line_of(speed), GEOMETRY)) is None
 
 
 def test_effects_are_parted_and_keep_their_order():

@@ -23,12 +23,19 @@ def errors(position_m, yaw_rad=0.02):
     return PredictionErrors(position_m, interval, yaw_rad, (0.9 * yaw_rad, 1.1 * yaw_rad), 0.1, {"curves": position_m})
 
 
+NO_ERRORS = PredictionErrors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
+
+
+def effect(name, wide=0.0, **values):
+    """A finding of parameters whose intervals reach so far to either side."""
+    estimates = {key: ParameterEstimate(value, value - wide, value + wide) for key, value in values.items()}
+    return EffectFinding(name, "command_to_wheel", estimates, 9.0)
+
+
 def report(amended_m, yaw_rad=0.02, blind=(), offered="amended"):
     sizes = dict(zip(STAGES, (0.06, 0.05, 0.047, amended_m, 0.014), strict=True))
-    gap = {
-        s: {h: errors(size, yaw_rad if s == "amended" else 0.02) for h in (0.5, 1.0, 2.0, 5.0)}
-        for s, size in sizes.items()
-    }
+    of = {s: errors(size, yaw_rad if s == "amended" else 0.02) for s, size in sizes.items()}
+    gap = {s: dict.fromkeys((0.5, 1.0, 2.0, 5.0), each) for s, each in of.items()}
     spots = tuple(
         BlindSpot(name, "k", "s", None, True, f"disco-hw drive ROBOT.toml --script x: {name}") for name in blind
     )
@@ -70,11 +77,9 @@ def test_a_model_that_predicts_worse_is_not_recommended():
         "Drive with the timed model, which is in model.toml. "
         "The amended model has more effects and does not clearly predict better."
     )
-    assert worse.as_dict()["gap"]["offered"] == "timed"
-    assert (
-        worse.as_dict()["gap"]["why_not_amended"]
-        == "The amended model has more effects and does not clearly predict better."
-    )
+    told = worse.as_dict()["gap"]
+    assert told["offered"] == "timed"
+    assert told["why_not_amended"] == "The amended model has more effects and does not clearly predict better."
     assert report(0.048).as_dict()["gap"]["why_not_amended"] is None
 
 
@@ -116,9 +121,8 @@ def test_the_page_says_what_is_in_the_model():
 
 
 def test_a_log_of_short_stretches_says_that_it_does_not_tell_the_gap():
-    nan = PredictionErrors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
     some = report(0.014)
-    short = replace(some, gap={s: dict.fromkeys(of, nan) for s, of in some.gap.items()})
+    short = replace(some, gap={s: dict.fromkeys(of, NO_ERRORS) for s, of in some.gap.items()})
     assert summary_lines(short)[1] == "No stretch of the logs is long enough to see how far 2 s predictions are off."
     told = json.loads(as_json(short.as_dict()), parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     assert told["gap"]["amended"]["position_rmse_m"] is None
@@ -135,38 +139,24 @@ def test_the_page_names_the_score_that_a_name_takes():
 
 @pytest.mark.parametrize(("wide", "said"), [(0.004, True), (0.006, False)])
 def test_that_wheels_are_unequal_is_said_where_only_their_load_shows_it_and_it_is_known(wide, said):
-    load = EffectFinding(
-        "turning_load",
-        "command_to_wheel",
-        {
-            "load_rad_s": ParameterEstimate(0.53, 0.5, 0.56),
-            "unequal": ParameterEstimate(-0.0095, -0.0095 - wide, -0.0095 + wide),
-        },
-        9.0,
-    )
-    found = replace(report(0.014), effects=(load,))
-    assert summary_lines(found)[0].startswith(
-        "Turning takes 0.53 rad/s from each side's wheels, however fast the robot turns"
-    )
-    assert ("the right wheels are -0.95% larger than the mean" in summary_lines(found)[0]) is said
+    load = effect("turning_load", wide, load_rad_s=0.53, unequal=-0.0095)
+    line = summary_lines(replace(report(0.014), effects=(load,)))[0]
+    assert line.startswith("Turning takes 0.53 rad/s from each side's wheels, however fast the robot turns")
+    assert ("the right wheels are -0.95% larger than the mean" in line) is said
 
 
 @pytest.mark.parametrize(("delay_s", "wrong"), [(0.12, False), (-0.17, True)])
 def test_a_response_before_its_command_is_said_to_be_a_wrong_clock(delay_s, wrong):
-    late = EffectFinding(
-        "command_delay", "command_to_wheel", {"delay_s": ParameterEstimate(delay_s, delay_s, delay_s)}, 9.0
-    )
-    assert ("clock" in sentence(late)) == wrong
+    assert ("clock" in sentence(effect("command_delay", delay_s=delay_s))) == wrong
 
 
 def test_a_log_of_short_runs_is_answered_as_far_ahead_as_it_reaches():
-    nan = PredictionErrors(math.nan, (math.nan, math.nan), math.nan, (math.nan, math.nan), math.nan, {})
     some = report(0.014)
-    short = replace(some, gap={s: {h: e if h < 2.0 else nan for h, e in of.items()} for s, of in some.gap.items()})
+    gap = {s: {h: e if h < 2.0 else NO_ERRORS for h, e in of.items()} for s, of in some.gap.items()}
+    short = replace(some, gap=gap)
     assert short.horizon_s == 1.0
-    assert summary_lines(short)[1].startswith(
-        "1 s ahead, in parts of the log that were not used, predictions are off by 47 mm"
-    )
+    begins = "1 s ahead, in parts of the log that were not used, predictions are off by 47 mm"
+    assert summary_lines(short)[1].startswith(begins)
     assert short.as_dict()["gap"]["horizon_s"] == 1.0
     assert offered_stage(short.gap, True, DEFAULT_SETTINGS) == "amended"
     worse = {**short.gap, "amended": short.gap["nominal"]}
@@ -199,8 +189,7 @@ def test_the_page_defines_its_words_in_the_margin_and_folds_what_is_for_experts(
 
 
 def test_an_answer_of_many_names_is_short():
-    lag = ParameterEstimate(0.2, 0.1, 0.3)
-    effects = tuple(EffectFinding("motor_lag", "command_to_wheel", {"tau_s": lag}, 9.0) for _ in range(5))
+    effects = (effect("motor_lag", 0.1, tau_s=0.2),) * 5
     lines = summary_lines(replace(report(0.014, blind=FIVE), effects=effects))
     assert lines[2].endswith(". And 2 more, listed below.")
     assert " ".join(lines).count("time constant") == 3
@@ -209,9 +198,8 @@ def test_an_answer_of_many_names_is_short():
     few = summary_lines(replace(report(0.014, blind=("turn_slip",)), effects=effects[:3]))
     assert " ".join(few[:3]).count("time constant") == 3
     assert "more" not in " ".join(few[:3])
-    assert few[5].startswith(
-        "Drive next: `disco-hw drive ROBOT.toml --script spins`; this log could not have shown turn_"
-    )
+    next_drive = "Drive next: `disco-hw drive ROBOT.toml --script spins`; this log could not have shown turn_"
+    assert few[5].startswith(next_drive)
 
 
 def test_what_logs_share_is_told_apart_from_what_differs():

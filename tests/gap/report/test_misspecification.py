@@ -6,41 +6,24 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from disco_hw.gap.data.free_runs import read_angles
-from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.report.misspecification import _answers_otherwise, _apart, disputed_names
 from disco_hw.gap.search.channel_result import ChannelResult
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.unnamed_terms import motion
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import NOISE, body_channel, line_of, searched, selector_of, vector_of
+from tests.gap.synthetic import body_channel, body_on, line_of, poses_of, searched, selector_of, vector_of
 
 # Turns at four rates: at two of them a wrong axial distance makes up for any form.
 DRIVE = ((4, 4), (0, 0), (-1, 1), (1, -1), (-2, 2), (2, -2), (-3.5, 3.5), (3.5, -3.5), (-6, 6), (6, -6), (3, 6), (6, 3))
 
 
-def driven():
-    """The drive without poses, and the vector of a robot that is as drawn."""
-    return line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)), vector_of()
-
-
-def found_of(name, truth, perturbation):
-    """What is found, by that name, in a drive of a robot with this vector and perturbation of its motion."""
-    line, plain = driven()
-    channel = BodyChannel.build(line, NOISE, plain)
-    clean = np.empty((line.pose.t_s.size, 3))
-    read_angles(channel.track(truth, perturbation), line.pose.node, line.pose.fraction, clean)
-    noise = np.random.default_rng(5).standard_normal(clean.shape) * (0.004, 0.004, 0.006)
-    channel = BodyChannel.build(replace(line, pose_values=clean + noise), NOISE, plain)
-    return searched(channel, (name,))
-
-
 def aside(of_left_m, of_right_m):
     """What is found of a robot that turns about a point so far to its left, in turns to the left and to the right."""
-    line, truth = driven()
+    line, truth = line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)), vector_of()
     rate = motion(line, truth)[1]
     ahead = np.where(rate > 0.0, of_left_m, of_right_m) * rate
-    return found_of("lateral_icr", truth, np.column_stack([ahead, np.zeros((rate.size, 2))]))
+    poses = poses_of(line, truth, np.column_stack([ahead, np.zeros((rate.size, 2))]), seed=5)
+    return searched(body_on(line, poses), ("lateral_icr",))
 
 
 def test_a_name_whose_value_is_another_where_the_robot_drives_differently_is_disputed():

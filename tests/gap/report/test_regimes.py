@@ -67,7 +67,5 @@ def test_gain_and_its_scatter_come_from_blocks():
     total, spread = gain_by_block(is_alternative, block, 4)
     assert total == 60.0
     assert total < 3.0 * spread
-
-
-def test_too_few_blocks_say_nothing():
+    # Too few blocks say nothing.
     assert math.isinf(gain_by_block(np.ones(90), np.repeat(np.arange(3), 30), 4)[1])

@@ -9,14 +9,14 @@ from disco_hw.gap.report import EffectFinding
 from disco_hw.gap.report.page import page, summary_lines
 from disco_hw.gap.report.remains import Remains
 from disco_hw.gap.search.channel_result import ParameterEstimate
-from disco_hw.gap.search.cross_validation import PredictionErrors
 from tests.gap.report.test_findings import report
+from tests.gap.synthetic import errors_of_size
 from tests.gap.test_write_report import report_of
 
 
 def errors(position_m, yaw_rad, **by_regime):
     squares = by_regime or {"curves": (position_m**2, yaw_rad**2)}
-    return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.1, {}, regime_squares=squares)
+    return errors_of_size(position_m, yaw_rad, regime_squares=squares)
 
 
 TIMED, FLOOR = errors(0.05, 0.10), errors(0.01, 0.02)

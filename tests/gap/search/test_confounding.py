@@ -30,25 +30,31 @@ def estimates(**values):
     )
 
 
-def test_a_gain_of_one_wheel_with_the_opposite_asymmetry_is_one_encoder():
-    gains = estimates(wheel_gain__left=0.0, wheel_gain__right=0.04)
-    expected = -0.04 / 2.04
-    assert one_encoder(gains, (expected, 0.001), SETTINGS) == (True, True)
-    assert one_encoder(gains, (-expected, 0.001), SETTINGS) == (False, False)
-
-
-def test_an_asymmetry_too_small_to_be_named_still_decides():
-    gains = estimates(wheel_gain__left=0.0, wheel_gain__right=0.008)
-    expected = -0.008 / 2.008
-    # Four standard deviations from none, at what the encoder would make it.
-    assert one_encoder(gains, (expected, 0.0007), SETTINGS) == (True, True)
-    # Three nats say so, and then two and a half.
-    assert one_encoder(gains, (expected, 0.0011), SETTINGS) == (True, True)
-    assert one_encoder(gains, (expected, 0.0014), SETTINGS) == (True, False)
-    # Nobody knows: either.
-    assert one_encoder(gains, (0.5 * expected, 0.003), SETTINGS) == (True, False)
-    # None, and not what the encoder would make it.
-    assert one_encoder(gains, (0.0, 0.0007), SETTINGS) == (False, False)
+@pytest.mark.parametrize(
+    ("left", "right", "times_expected", "deviation", "possible", "cause"),
+    [
+        (0.0, 0.04, 1.0, 0.001, True, True),
+        # The other way round, and none at all.
+        (0.0, 0.04, -1.0, 0.001, False, False),
+        (0.0, 0.04, 0.0, 0.001, False, False),
+        (0.04, 0.04, 0.0, 0.001, True, False),
+        # Too small to be named it still decides: four standard deviations from none, at what the encoder would make it.
+        (0.0, 0.008, 1.0, 0.0007, True, True),
+        # Three nats say so, and then two and a half.
+        (0.0, 0.008, 1.0, 0.0011, True, True),
+        (0.0, 0.008, 1.0, 0.0014, True, False),
+        # Nobody knows: either.
+        (0.0, 0.008, 0.5, 0.003, True, False),
+        # None, and not what the encoder would make it.
+        (0.0, 0.008, 0.0, 0.0007, False, False),
+    ],
+)
+def test_a_gain_of_one_wheel_with_the_opposite_asymmetry_is_one_encoder(
+    left, right, times_expected, deviation, possible, cause
+):
+    asymmetry = times_expected * -right / (2.0 + right)
+    gains = estimates(wheel_gain__left=left, wheel_gain__right=right)
+    assert one_encoder(gains, (asymmetry, deviation), SETTINGS) == (possible, cause)
 
 
 def test_gains_that_are_hardly_known_are_no_encoder_however_clear_the_asymmetry():
@@ -60,13 +66,6 @@ def test_gains_that_are_hardly_known_are_no_encoder_however_clear_the_asymmetry(
         }
     )
     assert one_encoder(gains, (0.0118, 0.0011), SETTINGS) == (True, False)
-
-
-def test_without_an_asymmetry_a_gain_of_one_wheel_is_a_gain():
-    gains = estimates(wheel_gain__left=0.0, wheel_gain__right=0.04)
-    assert one_encoder(gains, (0.0, 0.001), SETTINGS) == (False, False)
-    both = estimates(wheel_gain__left=0.04, wheel_gain__right=0.04)
-    assert one_encoder(both, (0.0, 0.001), SETTINGS) == (True, False)
 
 
 def test_lateral_offsets_are_one_class():
@@ -86,14 +85,11 @@ def gains_that_show(asymmetry, left_deviation=0.002, right_deviation=0.006):
     )
 
 
-def test_an_encoder_is_possible_within_three_deviations_of_what_body_and_wheels_say():
+def test_an_encoder_is_possible_within_three_deviations_and_the_cause_where_that_says_three_nats_more_than_none():
     # Of the body 3 per mil, of the gains 4 on the mean: 5 together.
     for sigmas, possible in ((2.9, True), (3.1, False), (-2.9, True), (-3.1, False)):
         value = 0.05 + 0.005 * sigmas
         assert one_encoder(gains_that_show(0.05), (value, 0.003), SETTINGS) == (possible, possible)
-
-
-def test_it_is_the_cause_where_it_says_so_by_three_nats_against_none():
     for value, cause in ((0.0134, True), (0.0130, False)):
         # One deviation of 5 per mil away from what it would be.
         assert one_encoder(gains_that_show(value - 0.005), (value, 0.003), SETTINGS) == (True, cause)

@@ -14,12 +14,10 @@ from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.channel_search import indices
 from disco_hw.gap.search.cross_validation import (
     Chain,
-    PredictionErrors,
     errors_of,
     floor_errors,
     fold_of,
     fold_vectors,
-    regimes_driven,
     scored_horizon_s,
     smoothed_poses,
     within_one_standard_error,
@@ -28,7 +26,7 @@ from disco_hw.gap.search.cross_validation import (
 from disco_hw.gap.search.end_to_end import Ahead
 from disco_hw.gap.search.least_squares import fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S, Folds
-from tests.gap.synthetic import NOISE, body_channel, body_on, vector_of
+from tests.gap.synthetic import NOISE, body_channel, errors_in_stretches, vector_of
 
 AHEAD_S = 2.0
 
@@ -52,37 +50,10 @@ def test_the_right_model_errs_by_the_noise_alone_and_a_wrong_one_by_more():
     assert wrong.by_regime_m["turning on the spot"] > 2.0 * sound.by_regime_m["turning on the spot"]
 
 
-def test_smoothed_poses_are_closer_to_the_truth_than_measured_ones():
-    channel, _ = body_channel()
-    smooth, alone = smoothed_poses(channel, channel.neutral)
-    truth = channel.track(channel.neutral)
-    inside = np.isfinite(smooth[:, 0]) & np.isfinite(alone[:, 0])
-    assert inside.mean() > 0.95
-    error = [np.sqrt(np.mean((poses - truth)[inside, :2] ** 2)) for poses in (smooth, alone)]
-    assert error[0] < 0.6 * error[1]
-    assert error[1] == pytest.approx(NOISE.position_m, rel=0.3)
-
-
 def test_a_log_of_two_minutes_is_divided_into_long_stretches_and_a_shorter_one_finer():
     _, line = body_channel()
     for duration_s, folds in ((126.0, Folds(21.0, 2)), (125.9, Folds(9.0, 4))):
         assert replace(line, t_s=np.zeros(round(duration_s / GRID_STEP_S))).folds == folds
-
-
-def test_each_fold_is_predicted_by_what_was_fitted_on_the_others():
-    channel, line = body_channel()
-    spoilt = line.pose_values.copy()
-    # In the first stretch of time every turn is measured a tenth too large.
-    first = line.pose.t_s < line.folds.stretch_s
-    spoilt[first, 2] *= 1.1
-    shifted = body_on(line, spoilt)
-    found = fit(shifted, channel.neutral, indices(shifted, ()))
-    folds = line.folds.count
-    vectors = fold_vectors(found, fold_of(shifted), folds, shifted.neutral, DEFAULT_SETTINGS)
-    axle = [vectors[fold][1] for fold in range(folds)]
-    # Fold 0 holds that stretch: who predicts it has not seen it.
-    assert axle[0] == pytest.approx(0.4, rel=0.01)
-    assert min(abs(each - 0.4) for each in axle[1:]) > 3.0 * abs(axle[0] - 0.4)
 
 
 def test_every_third_stretch_is_of_one_fold_of_three():
@@ -120,17 +91,10 @@ def test_stages_are_compared_as_far_ahead_as_runs_are_long(window_s, judged_s):
     assert np.isfinite(errors_of(channel, None, both(channel.neutral), judged_s, poses).position_m)
 
 
-def in_stretches(position, yaw):
-    """Errors whose squares in stretches of time are these."""
-    squares = np.column_stack([position, yaw]).astype(float)
-    size = np.sqrt(squares.mean(axis=0))
-    return PredictionErrors(size[0], (0.0, 1.0), size[1], (0.0, 1.0), 0.0, {}, squares)
-
-
 def test_the_larger_growth_of_position_and_heading_counts():
-    before = in_stretches([1.0] * 6, [4.0] * 6)
-    assert worse_by(before, in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
-    assert worse_by(before, in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
+    before = errors_in_stretches([1.0] * 6, [4.0] * 6)
+    assert worse_by(before, errors_in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
+    assert worse_by(before, errors_in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
 
 
 @pytest.mark.parametrize(
@@ -146,32 +110,32 @@ def test_the_larger_growth_of_position_and_heading_counts():
     ],
 )
 def test_as_good_as_the_best_is_what_exceeds_it_by_no_more_than_its_growth_scatters(position, yaw, within):
-    best = in_stretches([50.0, 50.0], [0.005, 0.005])
-    other = in_stretches(50.0 + 100.0 * np.array(position), 0.005 + 0.01 * np.array(yaw))
+    best = errors_in_stretches([50.0, 50.0], [0.005, 0.005])
+    other = errors_in_stretches(50.0 + 100.0 * np.array(position), 0.005 + 0.01 * np.array(yaw))
     assert within_one_standard_error(best, other) == within
+
+
+@pytest.mark.parametrize(
+    ("squares", "within"),
+    [
+        ([1.0, 1.0, 1.0, 1.0], True),
+        ([1.3, 0.8, 1.2, 0.8], True),
+        ([1.3, 1.2, 1.1, 1.2], False),
+        # A single stretch says nothing of the scatter.
+        ([1.0], True),
+        ([1.01], False),
+    ],
+)
+def test_errors_are_as_small_as_the_best_within_what_their_difference_scatters(squares, within):
+    best, other = ([1.0] * len(squares),) * 2, (squares,) * 2
+    assert within_one_standard_error(errors_in_stretches(*best), errors_in_stretches(*other)) == within
 
 
 @pytest.mark.parametrize(
     ("position_m", "yaw_rad", "within"), [(2.0, 1.0, True), (2.0, 1.01, False), (1.0, 2.1, False), (0.5, 3.9, True)]
 )
 def test_without_errors_by_stretch_the_best_is_what_errs_least_in_position_times_heading(position_m, yaw_rad, within):
-    best, other = in_stretches([1.0] * 4, [4.0] * 4), in_stretches([position_m**2] * 4, [yaw_rad**2] * 4)
+    best, other = errors_in_stretches([1.0] * 4, [4.0] * 4), errors_in_stretches([position_m**2] * 4, [yaw_rad**2] * 4)
     bare = [replace(one, squares=None) for one in (best, other)]
     for pair in ((bare[0], bare[1]), (best, bare[1]), (bare[0], other)):
         assert within_one_standard_error(*pair) == within
-
-
-def test_what_the_robot_did_is_told_of_every_start():
-    channel, line = body_channel()
-    node, ahead = np.arange(0, line.t_s.size - 200, 10), 150
-    told = dict(zip(node.tolist(), regimes_driven(channel, node, ahead), strict=True))
-    assert set(told.values()) == {
-        "standstill", "turning on the spot", "speeding up and braking", "curves", "straight ahead", "straight back",
-    }  # fmt: skip
-    # Two seconds each: straight ahead, rest, spin, spin, ahead, arc, arc, back.
-    expected = {
-        20: "straight ahead", 220: "standstill", 420: "turning on the spot", 820: "straight ahead", 1020: "curves",
-        1420: "straight back", 100: "speeding up and braking",
-    }  # fmt: skip
-    assert {start: told[start] for start in expected} == expected
-    assert regimes_driven(channel, node[:0], ahead) == []

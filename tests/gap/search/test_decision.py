@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from disco_hw.gap import offered_stage
-from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.search.decision import best_of, chance, first_as_good, is_as_good, score
 from disco_hw.gap.settings import DEFAULT_SETTINGS
+from tests.gap.synthetic import errors_in_stretches, errors_of_size
 
 
 def in_stretches(position_m, yaw_rad=None):
     """Errors of so much in each stretch of time, in heading as much as in position where nothing else is said."""
-    both = np.column_stack([position_m, position_m if yaw_rad is None else yaw_rad]).astype(float)
-    size = np.sqrt((both**2).mean(axis=0))
-    return PredictionErrors(size[0], (0.0, 1.0), size[1], (0.0, 1.0), 0.0, {}, both**2)
+    return errors_in_stretches(np.square(position_m), np.square(position_m if yaw_rad is None else yaw_rad))
 
 
 def test_a_stretch_scores_the_log_of_its_errors_and_the_noise_in_position_and_heading():
@@ -23,8 +21,7 @@ def test_a_stretch_scores_the_log_of_its_errors_and_the_noise_in_position_and_he
     assert score(errors, floor) == pytest.approx([0.5 * np.log(25.0 * 5.0), 0.5 * np.log(2.0 * 2.0)])
     assert score(errors, None) == pytest.approx([np.log(3.0 * 2.0), 0.0])
     # Sums over a whole log count as one stretch.
-    whole = PredictionErrors(3.0, (0.0, 1.0), 2.0, (0.0, 1.0), 0.0, {})
-    assert score(whole, None) == pytest.approx([np.log(6.0)])
+    assert score(errors_of_size(3.0, 2.0), None) == pytest.approx([np.log(6.0)])
     assert np.isfinite(score(in_stretches([0.0]), None)).all()
 
 
@@ -48,16 +45,14 @@ def test_a_millimetre_counts_by_what_the_noise_is():
         ([0.0, 0.01, 0.02, 0.01, 2.7, 2.0, 0.01, 0.01], 2 / 256),
         # One against it takes a half of these.
         ([1.0, -1.0], 3 / 4),
+        # Of a single stretch either sign is as likely.
+        ([1.0], 1 / 2),
     ],
 )
 def test_chance_is_the_share_of_signs_that_give_as_large_an_excess(worse_by, of_choices):
     assert chance(in_stretches([1.0] * len(worse_by)), in_stretches(np.exp(worse_by)), None) == pytest.approx(
         of_choices
     )
-
-
-def test_of_a_single_stretch_either_sign_is_as_likely():
-    assert chance(in_stretches([1.0]), in_stretches([np.e]), None) == 0.5
 
 
 def test_of_many_stretches_a_sample_of_signs_is_taken_that_is_always_the_same():
@@ -95,16 +90,13 @@ def test_as_good_is_what_may_be_worse_by_chance(worse_by, as_good):
     assert is_as_good(best, other, None) is as_good
 
 
-def test_as_good_is_what_is_worse_by_less_than_is_worth_a_change():
+def test_as_good_is_what_is_worse_by_less_than_is_worth_a_change_in_position_and_heading_together():
     best, other = in_stretches([1.0] * 4), in_stretches(np.exp([0.04] * 4))
     # Position and heading, a hundredth of e each four times.
     assert not is_as_good(best, other, None, worth=0.079)
     assert is_as_good(best, other, None, worth=0.081)
-
-
-def test_position_and_heading_pay_for_each_other():
-    best, other = in_stretches([1.0] * 4), in_stretches([0.5] * 4, [2.2] * 4)
-    assert not is_as_good(best, other, None)
+    # One pays for the other.
+    assert not is_as_good(best, in_stretches([0.5] * 4, [2.2] * 4), None)
     assert is_as_good(best, in_stretches([0.5] * 4, [2.0] * 4), None)
 
 
@@ -141,19 +133,15 @@ def test_an_amended_model_is_handed_out_where_it_is_clearly_better_than_a_delay_
     assert offered([1.0] * 4, amended) == stage
 
 
-def test_a_model_that_adds_nothing_to_a_delay_and_a_lag_is_simpler_than_that():
+def test_the_model_that_is_handed_out_is_the_simplest_that_nothing_clearly_beats():
     level = [1.0, 1.0, 1.0]
     assert offered(level, level, adds=False) == "amended"
     assert offered(level, level, adds=True) == "timed"
     # Where nothing is missing the geometry is fitted, unless a delay and a lag are clearly better.
     assert offered([0.5] * 3, level, adds=False) == "timed"
-
-
-def test_the_geometry_alone_is_handed_out_where_it_is_clearly_better_than_with_a_delay_and_a_lag():
+    # The geometry alone, where it is clearly better than with a delay and a lag.
     assert offered([3.0] * 4, [2.0] * 4, refitted=[1.0] * 4) == "refitted"
     assert offered([1.0, 0.99, 1.0, 1.0], [0.9, 1.05, 1.0, 1.0], refitted=[1.0, 1.1, 1.0, 0.9]) == "timed"
-
-
-def test_errors_below_the_noise_do_not_choose():
+    # Errors below the noise do not choose.
     assert offered([0.01] * 3, [0.005] * 3, noise=0.0001) == "amended"
     assert offered([0.01] * 3, [0.005, 0.02, 0.005], noise=0.5) == "timed"

@@ -10,10 +10,10 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.report.amend import at_joint_fit
 from disco_hw.gap.search import _on_top
 from disco_hw.gap.search.channel_result import ChannelEstimates, ParameterEstimate
-from disco_hw.gap.search.cross_validation import Chain, PredictionErrors, chain_wheels, smoothed_poses
+from disco_hw.gap.search.cross_validation import Chain, chain_wheels, smoothed_poses
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import GEOMETRY, body_channel, body_on, wheels_on
+from tests.gap.synthetic import GEOMETRY, body_channel, body_on, errors_of_size, wheels_on
 
 
 def geometry_of(vector, information=0.0):
@@ -38,13 +38,6 @@ def test_the_geometry_that_predicts_is_found_from_one_that_does_not():
     assert joint.vectors[0][:3] == pytest.approx(GEOMETRY, abs=2e-3)
     deviations = np.sqrt(np.diag(joint.covariance))
     assert (np.abs(joint.vectors[0][:3] - GEOMETRY) < 4.0 * deviations).all()
-
-
-def test_what_is_known_well_before_stays():
-    channel, _ = body_channel()
-    start = off(channel)
-    joint = predictions(channel).fit(geometry_of(start, information=1e12))
-    assert joint.vectors[0][:3] == pytest.approx(start[:3], rel=1e-3)
 
 
 def test_the_fold_that_is_left_out_is_not_looked_at():
@@ -74,7 +67,7 @@ def test_on_top_of_the_timed_model_a_channel_that_is_wrong_and_sure_does_not_hol
 
 
 def errors(position_m, yaw_rad):
-    return {2.0: PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {})}
+    return {2.0: errors_of_size(position_m, yaw_rad)}
 
 
 @pytest.mark.parametrize(

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 from disco_hw.gap.data import BODY, WHEEL
-from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.search import channel_result
 from disco_hw.gap.search.channel_result import InParts, drifted, estimate_parameters, in_equal_parts, in_logs, in_parts
 from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.settings import DEFAULT_SETTINGS, FitSettings, GapSettings
-from tests.gap.synthetic import GEOMETRY, body_on, line_of, vector_of, wheels_on
+from tests.gap.synthetic import GEOMETRY, body_on, line_of, poses_of, vector_of, wheels_on
 
 
 @pytest.mark.parametrize(("begins_s", "drives"), [((0.0,), 2.0), ((0.0, 30.0, 60.0), 4.0)])
@@ -71,11 +70,7 @@ def turned_sensor(commands):
     And how far its centre of turning is found from where it is (m).
     """
     line = line_of(np.repeat(np.array(commands, dtype=float), 6000 // len(commands), axis=0))
-    still = np.zeros((line.pose.t_s.size, 3))
-    poses = still.copy()
-    read_angles(body_on(line, still).track(vector_of()), line.pose.node, line.pose.fraction, poses)
-    poses += np.random.default_rng(3).standard_normal(poses.shape) * (0.004, 0.004, 0.006) + (0.0, 0.0, 0.02)
-    channel = body_on(line, poses)
+    channel = body_on(line, np.add(poses_of(line, vector_of(), seed=3), (0.0, 0.0, 0.02)))
     best = fit(channel, channel.neutral, channel.free)
     found = SimpleNamespace(reported=best, names=(), selector=SimpleNamespace(channel=channel))
     return found, best.vector[2] - GEOMETRY[2]
@@ -147,7 +142,9 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     # Halves that lie 3.1 and 2.9 of their deviations apart.
     sure, unsure = (InParts(np.array([0.0, of * 2.0**0.5]), np.ones(2)) for of in (-3.1, 2.9))
     quarters = InParts(np.array([0.0, 4.0, 0.0, 4.0]), np.ones(4))
-    shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: {"both": quarters, "short": quarters}}
+    alike = InParts(np.array([0.0, 0.5]), np.full(2, 0.1))
+    shown = {2: {"sure": sure, "unsure": unsure, "both": sure}, 4: dict.fromkeys(("both", "short"), quarters)}
+    shown[4]["little"] = alike
     monkeypatch.setattr(channel_result, "in_equal_parts", lambda found, count: shown[count])
     logs: dict[str, InParts] = {}
     monkeypatch.setattr(channel_result, "in_logs", lambda found: logs)
@@ -156,14 +153,14 @@ def test_a_value_wanders_by_what_halves_surely_differ_or_by_the_most_that_shorte
     told = drifted(of_blocks(np.arange(12)))
     assert told == {
         "sure": pytest.approx(4.0 * of_sure), "unsure": pytest.approx(of_unsure), "both": pytest.approx(4.0 * of_sure),
-        "short": pytest.approx((16.0 - 3.0) / 3.0),
+        "short": pytest.approx((16.0 - 3.0) / 3.0), "little": pytest.approx(0.125 - 0.01),
     }  # fmt: skip
     # What goes on from drive to drive is seen in halves alone.
     shown[2] = {"short": unsure}
     assert drifted(of_blocks(np.arange(12)))["short"] == pytest.approx(of_unsure)
     # And by what logs differ, where that is more.
-    logs |= {"short": quarters, "new": quarters, "little": InParts(np.array([0.0, 0.5]), np.full(2, 0.1))}
-    most = {"short": of_unsure, "new": 13.0 / 3.0, "little": 0.125 - 0.01}
+    logs |= {"short": quarters, "new": quarters, "slight": alike}
+    most = {"short": of_unsure, "new": 13.0 / 3.0, "slight": 0.125 - 0.01}
     told = drifted(of_blocks(np.arange(12)))
     assert {name: told[name] for name in most} == pytest.approx(most)
     logs["short"] = InParts(np.array([0.0, 5.0]), np.ones(2))

@@ -9,7 +9,6 @@ import pytest
 from scipy.signal import lfilter
 
 from disco_hw.gap.data import WHEEL
-from disco_hw.gap.data.free_runs import read_angles
 from disco_hw.gap.noise.wheel_noise import WheelNoise
 from disco_hw.gap.report.judge import across_logs, drifting_parameters
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit, in_motion
@@ -18,13 +17,12 @@ from disco_hw.gap.search.channel_result import (
     InParts,
     ParameterEstimate,
     deviations_of,
-    drifted,
     estimate_parameters,
     in_equal_parts,
     in_logs,
 )
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
-from tests.gap.synthetic import DRIVE, GEOMETRY, body_channel, body_on, line_of, searched, vector_of, wheels_on
+from tests.gap.synthetic import DRIVE, body_channel, body_on, line_of, poses_of, searched, vector_of, wheels_on
 
 
 def estimated(channel, names=("turn_slip",)):
@@ -51,23 +49,6 @@ def test_intervals_hold_what_another_drive_gives(twelve):
     for here, there in permutations(twelve, 2):
         held += [here[name].low <= there[name].value <= here[name].high for name in TRUTH]
     assert 0.95 <= np.mean(held) <= 0.995
-
-
-def test_an_estimate_tells_its_standard_deviation_and_the_joint_one():
-    found = estimated(body_channel(turn_slip=0.08)[0])
-    place = found.fitted.index("turn_slip.k_s")
-    assert found.by_name["turn_slip.k_s"].deviation == pytest.approx(found.covariance[place, place] ** 0.5)
-    # More slip and a longer axle both take from turning: what is known is their sum.
-    axle = found.fitted.index("axial_distance_m")
-    assert found.covariance[place, axle] < 0.0
-
-
-def test_noise_larger_than_thought_widens_the_interval():
-    channel, line = body_channel(turn_slip=0.08)
-    wander = 0.05 * np.sin(2.0 * np.pi * channel.samples.t_s[:, None] / (7.0, 11.0, 17.0))
-    shaken = body_on(line, line.pose_values + wander)
-    found = [estimated(one).by_name["turn_slip.k_s"] for one in (channel, shaken)]
-    assert found[1].deviation > 2.0 * found[0].deviation
 
 
 def test_the_time_of_a_change_has_an_interval_around_it():
@@ -115,11 +96,9 @@ def of_two_logs(channel):
 
 
 def test_halves_that_disagree_widen_the_interval_to_hold_both():
-    names = ("turn_slip",)
     same, drifting = changing(0.08), changing(0.16)
-    found = [estimated(one, names).by_name["turn_slip.k_s"] for one in (same, drifting)]
-    result = searched(drifting, names)
-    early, late = in_equal_parts(result, 2)["turn_slip.k_s"].values
+    found = [estimated(one).by_name["turn_slip.k_s"] for one in (same, drifting)]
+    early, late = in_equal_parts(searched(drifting, ("turn_slip",)), 2)["turn_slip.k_s"].values
     assert (early, late) == pytest.approx((0.08, 0.16), abs=0.03)
     assert found[1].low < early < late < found[1].high
     assert found[0].deviation < 0.3 * found[1].deviation
@@ -149,16 +128,12 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
     """On a circle a longer axle is as good as slip."""
     rich = 2 * DRIVE
     line = line_of(np.repeat(np.array([(3, 5)] * len(rich) + list(rich), dtype=float), 200, axis=0))
-    plain, truth = body_on(line, line.pose_values), vector_of(turn_slip=0.08)
-    poses = np.empty((line.pose.t_s.size, 3))
-    noise = np.random.default_rng(4).standard_normal(poses.shape) * (0.004, 0.004, 0.006)
-    read_angles(plain.track(truth), line.pose.node, line.pose.fraction, poses)
-    channel = body_on(line, poses + noise)
+    channel = body_on(line, poses_of(line, vector_of(turn_slip=0.08), seed=4))
     result = searched(channel, ("turn_slip",))
     found = in_equal_parts(result, 2)
     assert "turn_slip.k_s" not in found
     assert "axial_distance_m" not in found
-    assert found["x_icr_m"].values == pytest.approx((GEOMETRY[2], GEOMETRY[2]), abs=0.005)
+    assert found["x_icr_m"].values == pytest.approx([vector_of()[2]] * 2, abs=0.005)
     # Of three logs, of which the first is such a circle, the two others speak.
     quarter_s = 0.25 * channel.drive.duration_s
     three = replace(channel, drive=replace(channel.drive, log_begins_s=(0.0, 2.0 * quarter_s, 3.0 * quarter_s)))
@@ -168,14 +143,12 @@ def test_a_part_that_cannot_tell_two_parameters_apart_says_nothing_of_either():
 
 
 def test_each_of_several_logs_speaks_for_itself():
-    channel = of_two_logs(changing(0.16))
-    result = searched(channel, ("turn_slip",))
+    result = searched(of_two_logs(changing(0.16)), ("turn_slip",))
     found = in_logs(result)
     assert found["turn_slip.k_s"].values == pytest.approx((0.08, 0.16), abs=0.03)
     assert found["turn_slip.k_s"].apart(0, 1) > 3.0
     assert abs(found["wheel_radius_m"].apart(0, 1)) < 3.0
-    one = changing(0.16)
-    assert in_logs(searched(one, ("turn_slip",))) == {}
+    assert in_logs(searched(changing(0.16), ("turn_slip",))) == {}
     assert in_equal_parts(result, 3)["turn_slip.k_s"].values.size == 3
 
 
@@ -223,25 +196,7 @@ def test_logs_of_one_robot_differ_in_what_changed_between_them_alone():
             assert all(low < value < high for value, low, high in each.values)
 
 
-@pytest.mark.parametrize(
-    ("halves", "quarters", "noise", "expected"),
-    [(0.3, 0.5, 1e-6, 1.2), (0.1, 0.5, 1e-6, 0.5), (0.3, 0.1, 0.2, 0.26), (0.3, 0.1, 0.15, 4.0 * 0.2775)],
-)
-def test_what_halves_surely_differ_by_goes_on_and_what_quarters_differ_by_comes_and_goes(
-    monkeypatch, halves, quarters, noise, expected
-):
-    spread = {2: halves, 4: quarters}
-
-    def in_parts(found, parts):
-        count = np.unique(parts).size
-        assert np.bincount(parts).tolist() == [12 // count] * count
-        return {"motor_lag.tau_s": InParts(np.array([0.0, (2.0 * spread[count]) ** 0.5]), np.full(2, noise))}
-
-    monkeypatch.setitem(drifted.__globals__, "in_parts", in_parts)
-    monkeypatch.setitem(drifted.__globals__, "in_logs", lambda found: {})
-    channel = SimpleNamespace(block=np.repeat(np.arange(12), 5), settings=DEFAULT_SETTINGS)
-    found = SimpleNamespace(channel=channel, selector=SimpleNamespace(channel=channel))
-    assert drifted(found) == {"motor_lag.tau_s": pytest.approx(expected)}
+UNEVEN = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
 
 
 def wheels_that_lose(lost_on_the_spot):
@@ -257,9 +212,7 @@ def wheels_that_lose(lost_on_the_spot):
     error = lfilter([(1.0 - keep**2) ** 0.5], [1.0, -keep], rng.standard_normal(turned.shape), axis=0)
     speed = turned * (1.0 + 0.015 * error) + 0.02 * rng.standard_normal(turned.shape)
     line = replace(line_of(speed), command_rad_s=np.repeat(commands, 50, axis=0))
-    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
-    channel = wheels_on(line, noise)
-    return searched(channel, ("deadband",))
+    return searched(wheels_on(line, UNEVEN), ("deadband",))
 
 
 def wheels_that_stick(thresholds):
@@ -269,9 +222,7 @@ def wheels_that_stick(thresholds):
     command = np.tile(ramp, thresholds.size)[:, None] * (1.0, 1.0)
     turned = np.where(command > np.repeat(thresholds, ramp.size)[:, None], command, 0.0)
     line = replace(line_of(turned + 0.02 * rng.standard_normal(turned.shape)), command_rad_s=command)
-    noise = WheelNoise(relative=0.015, correlation_s=0.15, stamp_s=1e-6, drift_std=1e-3, drift_rad_sqrt_s=2e-3)
-    channel = wheels_on(line, noise)
-    return searched(channel, ("stiction",))
+    return searched(wheels_on(line, UNEVEN), ("stiction",))
 
 
 @pytest.mark.parametrize("scatters", [False, True])

@@ -1,12 +1,11 @@
 """Least squares within bounds, and normal equations by block."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from disco_hw.gap.search.least_squares import by_block, fit, inverse, jacobian, solve
+from disco_hw.gap.search.least_squares import by_block, fit, inverse, solve
 from disco_hw.gap.settings import DEFAULT_SETTINGS
 
 T = np.linspace(0.0, 4.0, 400)
@@ -43,14 +42,6 @@ def test_what_is_not_told_stays_near_what_is_expected_and_what_is_told_is_fitted
     assert told.vector[1] == pytest.approx(0.7, rel=1e-3)
 
 
-def test_blocks_add_up_to_the_whole():
-    found = fit(channel((2.0, 0.7), noise=0.1), np.array([1.0, 0.5]), (0, 1))
-    normal, gradient = by_block(found, np.arange(T.size) // 40)
-    assert normal.shape == (10, 2, 2)
-    np.testing.assert_allclose(normal.sum(axis=0), found.information())
-    np.testing.assert_allclose(gradient.sum(axis=0), found.jacobian.T @ found.residual)
-
-
 def test_a_direction_without_information_gets_a_large_variance():
     matrix = np.array([[4.0, 0.0], [0.0, 0.0]])
     assert inverse(matrix)[0, 0] == pytest.approx(0.25)
@@ -63,19 +54,6 @@ def test_the_variance_of_what_is_known_badly_is_exact():
     # Two columns that are alike to a hundredth: their sum is known well, their difference badly.
     matrix = np.array([[1.0, 0.9999], [0.9999, 1.0]])
     np.testing.assert_allclose(inverse(matrix) @ matrix, np.eye(2), atol=1e-6)
-
-
-def test_the_derivative_is_taken_from_within_the_bounds():
-    asked = []
-
-    def residual(p):
-        asked.append(float(p[0]))
-        return np.array([3.0 * p[0]])
-
-    layout = SimpleNamespace(step=np.array([1e-3]), high=np.array([1.0]))
-    at = np.array([1.0])
-    np.testing.assert_allclose(jacobian(residual, at, (0,), layout, 3.0 * at), [[3.0]])
-    assert max(asked) < 1.0
 
 
 def test_a_step_that_overshoots_is_made_shorter_until_it_betters_the_fit():
@@ -149,12 +127,3 @@ def test_a_loose_fit_comes_as_near_and_asks_for_less():
     assert not exact.loose
     # Its derivatives are those where it ends, and not what it was fitted with.
     np.testing.assert_allclose(loose.jacobian[:, 0], -np.exp(-loose.vector[1] * T), rtol=1e-6)
-
-
-def test_derivatives_that_lead_nowhere_are_taken_anew():
-    curve = channel((2.0, 0.7))
-    start = fit(curve, np.array([0.5, 0.1]), (0, 1), 0)
-    astray = replace(start, slope=-start.jacobian, loose=True, carried=True)
-    found = fit(curve, astray, (0, 1), loose=True)
-    np.testing.assert_allclose(found.vector, [2.0, 0.7], rtol=1e-2)
-    np.testing.assert_allclose(found.jacobian[:, 0], -np.exp(-found.vector[1] * T), rtol=1e-6)

@@ -30,17 +30,12 @@ def apart_as_wheels(apart_rad, command_rad_s=None):
     return moves((small, 1.0), (small + apart_rad, 1.0))
 
 
-def test_wheels_that_turn_further_move_the_robot_ahead_and_by_its_heading_half_the_way():
-    t_s = GRID_STEP_S * np.arange(800)
-    # In 2 s: 0.3 and 0.5 rad more; a way of 6 and 10 rad, half of it a lever of 0.24 m beside x_icr's 0.1.
-    ahead_m, turned_rad, lever_m = 0.03 * 0.8, 0.15 * 0.2, 0.24 + 0.1
+@pytest.mark.parametrize(("seconds", "ahead_s"), [(8.0, 2.0), (2.0, 1.0)])
+def test_wheels_that_turn_further_move_the_robot_ahead_and_by_its_heading_half_the_way(seconds, ahead_s):
+    t_s = GRID_STEP_S * np.arange(round(seconds / GRID_STEP_S))
+    # Ahead by 0.15 and 0.25 rad/s more; half the way of 3 and 5 rad/s is a lever beside x_icr's 0.1 m.
+    ahead_m, turned_rad, lever_m = 0.03 * 0.4 * ahead_s, 0.15 * 0.1 * ahead_s, 0.12 * ahead_s + 0.1
     expected = np.hypot(ahead_m, lever_m * turned_rad)
-    assert apart_as_wheels(np.outer(t_s, (0.15, 0.25))) == pytest.approx(expected, rel=1e-9)
-
-
-def test_in_a_short_run_wheels_are_compared_half_as_far_ahead():
-    t_s = GRID_STEP_S * np.arange(200)
-    expected = np.hypot(0.03 * 0.4, (0.12 + 0.1) * 0.15 * 0.1)
     assert apart_as_wheels(np.outer(t_s, (0.15, 0.25))) == pytest.approx(expected, rel=1e-9)
 
 

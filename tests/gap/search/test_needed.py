@@ -15,10 +15,9 @@ from disco_hw.gap.report.judge import left_out_notes
 from disco_hw.gap.search import joint_predictions
 from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelResult, ParameterEstimate
-from disco_hw.gap.search.cross_validation import PredictionErrors, within_one_standard_error
 from disco_hw.model import Model
 from tests.gap.search.test_lacking import analysis_of, found, told
-from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, selector_of
+from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, errors_in_stretches, selector_of
 
 
 def kept_of(names):
@@ -74,7 +73,7 @@ class Candidate:
         if self.is_on_top != "far":
             self.judged_so_far.append((has, self.is_on_top))
         square = self.squares.get((has, self.is_on_top), 9.0)
-        return stages._Evaluated(self, {}, errors(*[square] * 4))
+        return stages._Evaluated(self, {}, errors_in_stretches([square] * 4, [square] * 4))
 
 
 def needed(monkeypatch, squares, wheels=None, body=None):
@@ -202,19 +201,3 @@ def test_what_predictions_do_not_need_of_poses_is_not_said_to_be_of_this_log(end
     (note,) = left_out_notes(analysis, final, stages.lacking(analysis, "body", "heading_bias"))
     assert note.startswith("the amended model leaves out heading_bias: ")
     assert note.endswith(why)
-
-
-def errors(*squares):
-    of = np.column_stack([squares, squares])
-    size = float(np.sqrt(np.mean(squares)))
-    return PredictionErrors(size, (0.0, 1.0), size, (0.0, 1.0), 0.0, {}, of)
-
-
-def test_errors_are_as_small_as_the_best_within_what_their_difference_scatters():
-    best = errors(1.0, 1.0, 1.0, 1.0)
-    assert within_one_standard_error(best, best)
-    assert within_one_standard_error(best, errors(1.3, 0.8, 1.2, 0.8))
-    assert not within_one_standard_error(best, errors(1.3, 1.2, 1.1, 1.2))
-    # A single stretch says nothing of the scatter.
-    assert within_one_standard_error(errors(1.0), errors(1.0))
-    assert not within_one_standard_error(errors(1.0), errors(1.01))

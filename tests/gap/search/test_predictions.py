@@ -103,6 +103,12 @@ def test_where_no_pose_is_near_there_is_none():
     assert (apart_s > 0.11).sum() > 100
 
 
+def thinner(channel, every):
+    """The same drive with one pose in so many."""
+    line, chosen = channel.drive, np.arange(0, channel.drive.pose.t_s.size, every)
+    return with_poses(line, line.pose_values[chosen], picked(line.pose, chosen))
+
+
 def starts_at(node, pose, end, block=None):
     count = len(node)
     block = np.zeros(count, dtype=np.int64) if block is None else np.array(block)
@@ -227,9 +233,7 @@ def test_errors_are_root_mean_squares_by_regime_and_by_stretch():
     # Of two stretches either may be drawn twice.
     assert told.position_ci == pytest.approx((np.sqrt(2.0), np.sqrt(13.0)))
     assert told.yaw_ci == pytest.approx((np.sqrt(0.02), np.sqrt(0.025)))
-
-
-def test_of_no_predictions_nothing_is_told():
+    # Of no predictions nothing is told.
     nothing = np.empty((0, 3))
     told = summarise(nothing, np.empty(0), starts_at([], nothing, nothing), DEFAULT_SETTINGS.prediction)
     assert np.isnan([told.position_m, *told.position_ci, told.yaw_rad, *told.yaw_ci, told.wheel_rad_s]).all()
@@ -265,14 +269,8 @@ def test_each_stretch_is_drawn_as_often_as_any_other(odd_one):
 
 @pytest.mark.parametrize("every", [1, 4, 25])
 def test_the_floor_is_the_noise_of_a_pose_and_of_a_mean_and_a_heading_that_is_off_at_the_start(every):
-    channel = steady(3.0, 5.0, seconds=40.0, pose=(0.0, 0.0, 0.7))
-    if every > 1:
-        line = channel.drive
-        chosen = np.arange(0, line.pose.t_s.size, every)
-        channel = with_poses(line, line.pose_values[chosen], picked(line.pose, chosen))
-    smooth, alone = smoothed_poses(channel, vector_of())
-    noise = SensorNoise(0.004, 0.01, 0.05)
-    floor = floor_errors(channel, noise, 2.0, (smooth, alone))
+    channel = thinner(steady(3.0, 5.0, seconds=40.0, pose=(0.0, 0.0, 0.7)), every)
+    floor = floor_errors(channel, SensorNoise(0.004, 0.01, 0.05), 2.0, smoothed_poses(channel, vector_of()))
     # Poses within 0.3 s either side are averaged, one every 0.04 s.
     many = max(0.6 / (0.04 * every), 1.0)
     v, omega = 0.24, RADIUS_M / AXLE_M * 2.0
@@ -294,9 +292,7 @@ def test_the_floor_is_the_noise_of_a_pose_and_of_a_mean_and_a_heading_that_is_of
     ],
 )
 def test_a_heading_that_is_off_at_the_start_moves_the_end_aside_by_the_way(wheels, heading_rad, way_m):
-    line = steady(*wheels, seconds=40.0, pose=(0.0, 0.0, heading_rad)).drive
-    chosen = np.arange(0, line.pose.t_s.size, 4)
-    channel = with_poses(line, line.pose_values[chosen], picked(line.pose, chosen))
+    channel = thinner(steady(*wheels, seconds=40.0, pose=(0.0, 0.0, heading_rad)), 4)
     floor = floor_errors(channel, SensorNoise(1e-9, 0.01, 0.0), 2.0, smoothed_poses(channel, vector_of()))
     # One pose every 0.16 s, of those within 0.3 s either side.
     assert floor.position_m == pytest.approx(way_m * 0.01 / np.sqrt(0.6 / 0.16), rel=0.04)
@@ -360,6 +356,12 @@ def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself
     assert folds[1][0] == value
 
 
+def moving(v_m_s, omega_rad_s):
+    """A drive at a steady speed and yaw rate."""
+    both, apart = v_m_s / (0.5 * RADIUS_M), omega_rad_s * AXLE_M / RADIUS_M
+    return steady(0.5 * (both - apart), 0.5 * (both + apart))
+
+
 @pytest.mark.parametrize(
     ("v_m_s", "omega_rad_s", "told"),
     [
@@ -377,10 +379,10 @@ def test_what_the_other_fold_says_little_of_is_used_if_it_fixes_the_value_itself
     ],
 )
 def test_a_regime_is_told_by_mean_speed_and_mean_yaw_rate(v_m_s, omega_rad_s, told):
-    both, apart = v_m_s / (0.5 * RADIUS_M), omega_rad_s * AXLE_M / RADIUS_M
-    channel = steady(0.5 * (both - apart), 0.5 * (both + apart))
+    channel = moving(v_m_s, omega_rad_s)
     assert regimes_driven(channel, np.array([0, 100, 300]), 200) == [told] * 3
     assert regimes_driven(channel, np.array([0, 100]), 20) == [told] * 2
+    assert regimes_driven(channel, np.array([], dtype=int), 20) == []
 
 
 @pytest.mark.parametrize(
@@ -394,8 +396,7 @@ def test_a_regime_is_told_by_mean_speed_and_mean_yaw_rate(v_m_s, omega_rad_s, to
     ],
 )
 def test_at_a_bound_of_a_regime_the_robot_is_not_in_it(bound, v_m_s, omega_rad_s):
-    both, apart = v_m_s / (0.5 * RADIUS_M), omega_rad_s * AXLE_M / RADIUS_M
-    channel = steady(0.5 * (both - apart), 0.5 * (both + apart))
+    channel = moving(v_m_s, omega_rad_s)
     settings = replace(DEFAULT_SETTINGS, prediction=replace(DEFAULT_SETTINGS.prediction, **{bound: 0.0}))
     channel = replace(channel, drive=replace(channel.drive, settings=settings))
     assert regimes_driven(channel, np.array([100]), 200) == ["straight ahead"]

@@ -229,15 +229,18 @@ class Bent:
         return np.array([0.5 if moved < self.least else self.beyond])
 
 
-@pytest.mark.parametrize(("least", "share"), [(11.0, 1.0), (6.0, 0.5), (3.0, 0.25), (1.5, 0.125), (1.0, 0.0)])
-def test_a_step_of_the_richest_model_is_halved_until_it_fits_better(monkeypatch, least, share):
-    channel = Bent(least)
+@pytest.fixture
+def wide(monkeypatch):
+    """Lets entries grow as far as they like, and the noise be learnt with a mark."""
     monkeypatch.setattr(richest_model, "learn_body_noise", lambda of, vector, extra: ("learnt", vector, extra))
-    wide = replace(BODY, high=np.full_like(BODY.high, 1e9))
-    monkeypatch.setattr(Bent, "layout", wide)
-    vector = BODY.neutral.copy()
-    vector[0] = GEOMETRY[0]
-    learnt, moved, extra, many = learn_saturated_body(channel, (), vector, ())
+    monkeypatch.setattr(Bent, "layout", replace(BODY, high=np.full_like(BODY.high, 1e9)))
+
+
+@pytest.mark.usefixtures("wide")
+@pytest.mark.parametrize(("least", "share"), [(11.0, 1.0), (6.0, 0.5), (3.0, 0.25), (1.5, 0.125), (1.0, 0.0)])
+def test_a_step_of_the_richest_model_is_halved_until_it_fits_better(least, share):
+    channel = Bent(least)
+    learnt, moved, extra, many = learn_saturated_body(channel, (), vector_of(), ())
     full = 10.0 / (1.0 + DEFAULT_SETTINGS.fit.ridge)
     assert moved[0] - GEOMETRY[0] == pytest.approx(share * full, rel=1e-3, abs=1e-12)
     assert (learnt is channel) is (share == 0.0)
@@ -245,21 +248,17 @@ def test_a_step_of_the_richest_model_is_halved_until_it_fits_better(monkeypatch,
     assert many == 1
 
 
-def test_a_step_that_fits_as_well_as_none_is_none(monkeypatch):
-    monkeypatch.setattr(Bent, "layout", replace(BODY, high=np.full_like(BODY.high, 1e9)))
-    vector, channel = BODY.neutral.copy(), Bent(0.0, 1.0)
-    vector[0] = GEOMETRY[0]
+@pytest.mark.usefixtures("wide")
+def test_a_step_that_fits_as_well_as_none_is_none():
+    vector, channel = vector_of(), Bent(0.0, 1.0)
     learnt, moved, _, _ = learn_saturated_body(channel, (), vector, ())
     assert learnt is channel
     assert moved is vector
 
 
 def test_the_richest_model_stays_in_its_ranges(monkeypatch):
-    channel = Bent(100.0)
     monkeypatch.setattr(richest_model, "learn_body_noise", lambda of, vector, extra: of)
-    vector = BODY.neutral.copy()
-    vector[0] = GEOMETRY[0]
-    assert learn_saturated_body(channel, (), vector, ())[1][0] == BODY.high[0]
+    assert learn_saturated_body(Bent(100.0), (), vector_of(), ())[1][0] == BODY.high[0]
 
 
 def test_effects_see_the_commands_that_are_known_the_geometry_and_the_time_of_what_is_measured():

@@ -67,6 +67,15 @@ def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
     assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
 
 
+def assert_same_but_later(fits, place, by_s):
+    """Assert that the second of two fits is the first to the last bit, but for one entry that is later."""
+    first, second = fits
+    assert first.cost == second.cost
+    np.testing.assert_array_equal(first.residual, second.residual)
+    assert second.vector[place] == pytest.approx(first.vector[place] + by_s, abs=1e-15)
+    np.testing.assert_array_equal(np.delete(first.vector, place), np.delete(second.vector, place))
+
+
 @pytest.mark.thorough
 @thinned("curved", [0.0, -0.02], quick=1)
 def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(curved):
@@ -76,13 +85,8 @@ def test_commands_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(c
     assert set(moved.names) == {*plain.names, "command_delay"}
     assert [one.term.model_name for one in moved.unnamed] == [one.term.model_name for one in plain.unnamed]
     assert len(plain.unnamed) == (curved != 0.0)
-    both = moved.names
-    ends = [found.selector.fits[frozenset(both)] for found in (plain, moved)]
-    assert ends[0].cost == ends[1].cost
-    np.testing.assert_array_equal(ends[0].residual, ends[1].residual)
-    late = WHEEL.place["command_delay.delay_s"]
-    assert ends[1].vector[late] == pytest.approx(ends[0].vector[late] - 0.3, abs=1e-15)
-    np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
+    ends = [found.selector.fits[frozenset(moved.names)] for found in (plain, moved)]
+    assert_same_but_later(ends, WHEEL.place["command_delay.delay_s"], -0.3)
 
 
 @pytest.mark.thorough
@@ -96,14 +100,10 @@ def test_poses_are_searched_alike_to_the_last_bit_wherever_they_are_stamped(late
     both = ("pose_latency", "turn_slip")
     assert {"turn_slip"} <= set(plain.names) <= set(both)
     assert {"turn_slip"} <= set(moved.names) <= set(both)
-    ends = [found.selector.fits[frozenset(both)] for found in (plain, moved)]
-    assert ends[0].cost == ends[1].cost
-    np.testing.assert_array_equal(ends[0].residual, ends[1].residual)
     late = BODY.place["pose_latency.latency_s"]
-    assert ends[1].vector[late] == pytest.approx(ends[0].vector[late] - 0.25, abs=1e-15)
+    assert_same_but_later([found.selector.fits[frozenset(both)] for found in (plain, moved)], late, -0.25)
     # Without a name they are as late as they are stamped.
     assert [found.selector.start[late] for found in (plain, moved)] == pytest.approx([0.0, 0.0], abs=1e-15)
-    np.testing.assert_array_equal(np.delete(ends[0].vector, late), np.delete(ends[1].vector, late))
 
 
 @pytest.mark.thorough

@@ -78,9 +78,28 @@ def test_rivals_are_those_that_are_worse_by_less_than_it_takes_to_tell():
     [((), ("surface_change",), 3.0), ((A,), (A, "surface_change"), 3.0), ((), (A, "surface_change"), 4.0)],
 )
 def test_what_repeats_of_what_happens_once_pays_for_all_that_is_new(smaller, larger, parameters):
-    price = 0.5 * (parameters * np.log(1000))
+    # In noise that is 1.2 times what was thought.
+    price = 0.5 * 1.2 * (parameters * np.log(1000))
     for repeated, accepted in ((price, False), (1.001 * price, True)):
-        assert is_accepted(smaller, larger, EffectEvidence(50.0, 40.0, repeated, repeated, 1.0, 99.0)) == accepted
+        assert is_accepted(smaller, larger, EffectEvidence(50.0, 40.0, repeated, repeated, 1.2, 99.0)) == accepted
+
+
+@pytest.mark.parametrize(
+    ("name", "without_best", "without_two", "accepted"),
+    [
+        # An effect that does not begin at some time has to repeat, however little.
+        (A, 0.01, 70.0, True),
+        (A, 0.0, 70.0, False),
+        # In a third place each has to be worth a parameter: half of ln 1000.
+        (A, 70.0, 3.49, True),
+        (A, 70.0, 3.42, False),
+        ("surface_change", 70.0, 3.49, True),
+        ("surface_change", 70.0, 3.42, False),
+    ],
+)
+def test_every_effect_repeats_and_shows_beside_the_two_blocks_that_say_most(name, without_best, without_two, accepted):
+    proof = EffectEvidence(90.0, 80.0, without_best, without_two, 1.2, 99.0)
+    assert is_accepted((), (name,), proof) == accepted
 
 
 def test_evidence_pays_for_the_parameters_that_are_new(monkeypatch):

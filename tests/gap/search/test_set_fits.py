@@ -12,7 +12,7 @@ from disco_hw.gap.search.least_squares import Fit, fit
 from disco_hw.gap.search.richest_model import Candidate, Profile
 from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from tests.gap.synthetic import LIMITS, fit_at
+from tests.gap.synthetic import LIMITS, fit_at, vector_of
 
 # Half a score is a gain in nats.
 WORTH = 0.5 * LIMITS.score
@@ -125,16 +125,27 @@ def test_an_effect_does_nothing_where_all_it_has_beside_the_scanned_entry_is_neu
 
 @pytest.mark.parametrize("closely", [False, True])
 def test_a_set_is_fitted_anew_from_a_larger_one_only_where_that_is_clearly_better(monkeypatch, closely):
-    some = searching(closely)
-    better = DEFAULT_SETTINGS.fit.enough_nats
-    some.fits = {frozenset(names): fit_at(9.0) for names in (("turn_slip", "side_slip"), ("turn_slip",))}
+    both, rest = frozenset(("turn_slip", "side_slip")), frozenset({"turn_slip"})
+    some, better = searching(closely), DEFAULT_SETTINGS.fit.enough_nats
     some.channel.layout = BODY
-    some.fits[frozenset({"turn_slip", "side_slip"})] = fit_at(5.0, BODY.neutral)
-    for cost, kept in ((9.0 - better, 9.0), (8.99 - better, 8.99 - better)):
-        found = replace(fit_at(cost), loose=not closely)
-        monkeypatch.setattr(selection, "fit", lambda *_, loose, found=found: found if loose == found.loose else None)
-        some._refit_without(("turn_slip", "side_slip"), "side_slip", ("turn_slip",))
-        assert some.fit(("turn_slip",)).cost == kept
+    some.fits = {rest: fit_at(9.0), both: fit_at(5.0, vector_of(turn_slip=0.2, side_slip=0.3))}
+    some.proofs = {(rest, both): "with the worse fit", (frozenset(), both): "without it"}
+
+    def refitted(of, cost):
+        def fit(channel, begin, active, loose):
+            # From where the larger one ended, but for what goes.
+            np.testing.assert_array_equal(begin, vector_of(turn_slip=0.2))
+            return fit_at(cost if loose is not closely else np.nan)
+
+        monkeypatch.setattr(selection, "fit", fit)
+        of._refit_without(("turn_slip", "side_slip"), "side_slip", ("turn_slip",))
+        return of.fit(("turn_slip",)).cost, [*of.proofs.values()]
+
+    every = ["with the worse fit", "without it"]
+    assert refitted(some, 9.0 - better) == (9.0, every)
+    # What is given stays, and what rests on a worse fit is proved anew.
+    assert refitted(replace(some, given=("turn_slip",)), 1.0) == (9.0, every)
+    assert refitted(some, 8.99 - better) == (8.99 - better, ["without it"])
 
 
 class Scanned(Selector):

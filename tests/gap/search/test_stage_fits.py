@@ -13,12 +13,13 @@ from disco_hw.gap.data import BODY, WHEEL
 from disco_hw.gap.data.gridded_drive import GriddedDrive
 from disco_hw.gap.search import _chain, _Fitted, _information, _on_top, _roughly, _split, _timed, joint_predictions
 from disco_hw.gap.search.analysis import final_fit
-from disco_hw.gap.search.cross_validation import Chain, PredictionErrors
+from disco_hw.gap.search.cross_validation import Chain
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit
 from disco_hw.gap.search.richest_model import DELAY_STARTS_S
 from disco_hw.gap.settings import DEFAULT_SETTINGS, Folds
 from tests.gap.search.test_stages import LAG, SLIP, analysed
+from tests.gap.synthetic import errors_of_size
 
 DELAY = WHEEL.place["command_delay.delay_s"]
 
@@ -217,8 +218,7 @@ def errors_in_turn(monkeypatch, *sizes):
     left = list(sizes)
 
     def errors(body, wheels, chains, ahead_s, poses):
-        position_m, yaw_rad = left.pop(0) if left else (9.0, 9.0)
-        return PredictionErrors(position_m, (0.0, 1.0), yaw_rad, (0.0, 1.0), 0.0, {})
+        return errors_of_size(*(left.pop(0) if left else (9.0, 9.0)))
 
     monkeypatch.setattr(stages, "errors_of", errors)
 

@@ -177,16 +177,17 @@ def test_terms_of_a_given_model_are_added_up_by_channel():
     np.testing.assert_allclose(near.known_command, 0.1 * np.clip(u * np.abs(u), -2.0, 2.0), atol=1e-12)
     assert abs(v * w) > 0.01
     np.testing.assert_allclose(near.known_motion[:, 1], 0.4 * 0.01, atol=1e-12)
+    offered = by_form(wheel_terms(SimpleNamespace(drive=line), 0.5))
     load = with_known_terms(line, [EffectSetting("command += k u mean_1s(|u| + |u_other|)", {"k": 0.2})], p, 0.5)
-    offered = by_form(wheel_terms(SimpleNamespace(drive=line), 0.5))["command += 1 u mean_1s(|u| + |u_other|)"]
-    np.testing.assert_allclose(load.known_command, 0.2 * offered.perturbation, atol=1e-12)
+    expected = 0.2 * offered["command += 1 u mean_1s(|u| + |u_other|)"].perturbation
+    np.testing.assert_allclose(load.known_command, expected, atol=1e-12)
     before = [
         EffectSetting("command += k u mean_30s(u^2)", {"k": -0.1}),
         EffectSetting("omega += k (omega - mean_1s(omega))", {"k": -0.5}),
     ]
     remembered = with_known_terms(line, before, p, 0.5)
-    offered = by_form(wheel_terms(SimpleNamespace(drive=line), 0.5))["command += 1 u mean_30s(u^2)"]
-    np.testing.assert_allclose(remembered.known_command, -0.1 * offered.perturbation, atol=1e-12)
+    expected = -0.1 * offered["command += 1 u mean_30s(u^2)"].perturbation
+    np.testing.assert_allclose(remembered.known_command, expected, atol=1e-12)
     np.testing.assert_allclose(remembered.known_motion[:, 2], -0.5 * w * np.exp(-T_S - 0.005), rtol=1e-4)
 
 
@@ -243,29 +244,26 @@ def test_a_floor_as_large_as_may_be_is_still_looked_at():
     assert sought_on(lawn(largest_floor_m2=area_m2)[0])
 
 
+def in_spots(x_m, y_m, **settings):
+    """A body channel's drive that turns evenly, for a second in each of some spots."""
+    line = line_of(np.repeat([[1.0, 3.0]], 100 * len(x_m), axis=0))
+    measured = np.repeat(np.column_stack([x_m, y_m, y_m]), 100, axis=0)
+    chosen = replace(DEFAULT_SETTINGS, terms=TermSettings(**settings))
+    return SimpleNamespace(drive=line, samples=SimpleNamespace(t_s=line.t_s), measured=measured, settings=chosen)
+
+
 @pytest.mark.parametrize(
     ("least", "most", "told"), [(0.2, 0.8, [0.0, 3.0]), (0.25, 0.8, [0.0]), (0.2, 0.75, [3.0]), (0.1, 0.2, [])]
 )
 def test_a_patch_holds_more_than_the_least_and_less_than_the_most_of_all_turning(least, most, told):
     # Three quarters of it in one spot and the rest in another, at 1 rad/s.
-    line = line_of(np.repeat([[1.0, 3.0]], 400, axis=0))
-    x = np.repeat([0.0, 0.0, 0.0, 3.0], 100)
-    settings = replace(DEFAULT_SETTINGS, terms=TermSettings(least_inside=least, most_inside=most))
-    measured = np.column_stack([x, 0.0 * x, 0.0 * x])
-    channel = SimpleNamespace(drive=line, samples=SimpleNamespace(t_s=line.t_s), measured=measured, settings=settings)
+    channel = in_spots([0.0, 0.0, 0.0, 3.0], [0.0] * 4, least_inside=least, most_inside=most)
     discs = _discs(channel, np.array([0.5, 1.0]), ((spot_m, 0.0, 1.0) for spot_m in (0.0, 3.0)))
     assert [term.disc[0] for term in discs] == told
 
 
 def test_a_patch_ends_at_its_radius():
-    line = line_of(np.repeat([[1.0, 3.0]], 400, axis=0))
-    x, y = np.repeat([0.0, 3.0, 3.1, 9.0], 100), np.repeat([0.0, -4.0, -4.0, 0.0], 100)
-    channel = SimpleNamespace(
-        drive=line,
-        samples=SimpleNamespace(t_s=line.t_s),
-        measured=np.column_stack([x, y, y]),
-        settings=DEFAULT_SETTINGS,
-    )
+    channel = in_spots([0.0, 3.0, 3.1, 9.0], [0.0, -4.0, -4.0, 0.0])
     for radius_m, inside in ((5.0, 100), (5.01, 200), (5.1, 300)):
         (term,) = _discs(channel, np.array(GEOMETRY), [(0.0, 0.0, radius_m)])
         assert np.count_nonzero(term.perturbation[:, 2]) == inside

@@ -8,53 +8,24 @@ import pytest
 
 from disco_hw.gap import find_gap
 from disco_hw.gap.search import channel_search
-from disco_hw.gap.search.channel_result import ChannelResult, UnnamedTerm
-from disco_hw.gap.search.channel_search import best_terms, that_models_hold, with_unnamed
-from disco_hw.gap.search.evidence import EffectEvidence
+from disco_hw.gap.search.channel_search import best_terms, with_unnamed
 from disco_hw.gap.search.least_squares import fit
-from disco_hw.gap.search.selection import Selector
 from disco_hw.gap.search.unnamed_terms import Term, WithTerms, motion
 from disco_hw.model import Model, load_model, save_model
 from tests.gap.search.another_drive import another_drive, errors_ahead, without_terms
-from tests.gap.synthetic import LIMITS, body_channel, moved_by, searched, selector_of
+from tests.gap.synthetic import body_channel, moved_by, searched
 from tools.gap import strange_robot
-
-PROOF = EffectEvidence(100.0, 90.0, 80.0, 80.0, 1.0, 190.0)
 
 
 @cache
 def turning_less():
     """A channel whose robot turns less the faster it turns, its plain fit, and the yaw rate at the nodes."""
     channel, line = body_channel(turn_slip=0.1)
-    selector = selector_of(channel)
-    return ChannelResult(selector, (), channel), motion(line, channel.neutral)[1]
+    return searched(channel), motion(line, channel.neutral)[1]
 
 
 def on_turning(form, feature, **kinds):
     return Term(form, np.column_stack([np.zeros((feature.size, 2)), feature]), **kinds)
-
-
-def test_of_the_terms_that_promise_most_the_first_that_is_worth_it_is_taken(monkeypatch):
-    found, rate = turning_less()
-    good, poor, bad = (
-        on_turning(form, feature)
-        for form, feature in (
-            ("good {:.3g}", rate * np.abs(rate)),
-            ("poor {:.3g}", rate**3),
-            ("bad {:.3g}", 0.1 * np.sin(0.6 * np.arange(rate.size))),
-        )
-    )
-    options = [bad, poor, good]
-    promising, tried = best_terms(found.fit, found.channel, iter(options))
-    assert tried == 3
-    assert [term.form for term in promising] == [good.form, poor.form]
-    (taken,) = with_unnamed(found, lambda of: iter(options)).unnamed
-    assert taken.term is good
-    accept = channel_search._with_term
-    monkeypatch.setattr(
-        channel_search, "_with_term", lambda of, term, tried: (None, True) if term is good else accept(of, term, tried)
-    )
-    assert with_unnamed(found, lambda of: iter(options)).unnamed[0].term is poor
 
 
 def test_features_that_belong_together_have_a_coefficient_each_and_pay_for_each():
@@ -70,29 +41,6 @@ def test_features_that_belong_together_have_a_coefficient_each_and_pay_for_each(
     _, added = channel.split(np.concatenate([found.channel.neutral, [0.2, -0.1, 0.0]]))
     np.testing.assert_allclose(added[:, 2], rate * (0.2 * half - 0.1 * (1.0 - half)))
     assert both.written(np.array([0.3, -0.4])) == f"{0.5 / 2**0.5:.3g}"
-
-
-def carrying(name):
-    """What is found with a term that fits, and that a model carries under this name, or cannot carry."""
-    found, rate = turning_less()
-    term = on_turning("omega += {:.3g} omega |omega|", rate * np.abs(rate), model_name=name)
-    channel = WithTerms.of(found.channel, (term,))
-    selector = Selector(channel, found.selector.moves, LIMITS)
-    return replace(found, selector=selector, unnamed=(UnnamedTerm("", PROOF, term),), plain=found.selector)
-
-
-def test_what_every_model_can_carry_is_written_as_it_was_found():
-    found = carrying("omega += k omega |omega|")
-    assert that_models_hold(found) is found
-    bare, _ = turning_less()
-    assert that_models_hold(bare) is bare
-
-
-def test_in_place_of_what_no_model_can_carry_names_and_other_terms_are_fitted():
-    written = that_models_hold(carrying(None))
-    assert written.names == ("turn_slip",)
-    assert all(one.term.model_name is not None for one in written.unnamed)
-    assert written.plain is None or written.unnamed
 
 
 def test_tyres_that_slip_are_told_by_what_they_grip():

@@ -234,24 +234,20 @@ def test_a_patch_is_worth_it_without_the_block_that_says_most(monkeypatch):
     # Of four that were tried: what a term costs, one parameter and the choice, and 20 more.
     price = np.log(channel.count) + 2.0 * np.log(4.0)
     nats = 0.5 * 1.3 * (20.0 + price)
+
+    def with_term(one, *proof):
+        monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, *proof))
+        return _with_term(searched(channel), one, 4)
+
     for held_out_without_best, worth_it in ((1.001 * nats, True), (0.999 * nats, False)):
-        proof = EffectEvidence(90.0, 80.0, held_out_without_best, 0.0, 1.3, 99.0)
-        monkeypatch.setattr(channel_search, "compare", lambda *_, proof=proof: proof)
-        larger, happened_again = _with_term(searched(channel), patch, 4)
+        larger, happened_again = with_term(patch, held_out_without_best, 0.0, 1.3, 99.0)
         assert happened_again is (larger is not None) is worth_it
     # Another term has to repeat, however little, and in a third place; what is not worth it is none.
-    assert _with_term(searched(channel), term, 4) == (None, True)
-    shown = EffectEvidence(90.0, 80.0, 0.1, 0.51 * np.log(channel.count), 1.3, 99.0)
-    monkeypatch.setattr(channel_search, "compare", lambda *_: shown)
-    assert _with_term(searched(channel), term, 4)[0] is not None
-    for less in (
-        replace(shown, held_out_without_best=0.0),
-        replace(shown, held_out_without_two_best=0.49 * np.log(channel.count)),
-    ):
-        monkeypatch.setattr(channel_search, "compare", lambda *_, less=less: less)
-        assert _with_term(searched(channel), term, 4) == (None, True)
-    monkeypatch.setattr(channel_search, "compare", lambda *_: EffectEvidence(90.0, 80.0, 80.0, 80.0, 1.3, 19.0))
-    assert _with_term(searched(channel), patch, 4) == (None, True)
+    third = 0.5 * np.log(channel.count)
+    assert with_term(term, 0.1, 1.02 * third, 1.3, 99.0)[0] is not None
+    for less in ((0.999 * nats, 0.0), (0.0, 1.02 * third), (0.1, 0.98 * third)):
+        assert with_term(term, *less, 1.3, 99.0) == (None, True)
+    assert with_term(patch, 80.0, 80.0, 1.3, 19.0) == (None, True)
     again = EffectEvidence(90.0, 80.0, 30.0, 30.0, 1.5, 99.0).score_without_best(2.0, 1000)
     assert again == pytest.approx(2.0 * 30.0 / 1.5 - 2.0 * np.log(1000.0))
 
