@@ -158,11 +158,6 @@ def test_length_equals_that_of_a_bit_by_bit_frame(frame):
     assert frame_bits(frame) == len(wire) + 1 + 2 + 7 + 3
 
 
-@examples(quick=40, every=100, data=st.binary(min_size=8, max_size=8), can_id=st.integers(0, 0x7FF))
-def test_standard_frame_of_eight_bytes_takes_111_to_135_bits(data, can_id):
-    assert 111 <= frame_bits(CanFrame(can_id, data)) <= 135
-
-
 @given(st.integers(0, 8), st.booleans(), st.data())
 def test_no_frame_is_beyond_the_published_worst_case(length, extended, data):
     frame = CanFrame(data.draw(st.integers(0, 0x7FF)), data.draw(st.binary(min_size=length, max_size=length)), extended)
