@@ -184,13 +184,6 @@ def test_after_a_leap_frames_within_the_cycles_make_time_no_faster(bench):
     assert device_time_us(bench) == now_us
 
 
-@pytest.mark.parametrize(("ahead_us", "errors"), [(10_000, 0), (10_001, 1)])
-def test_a_frame_may_be_stamped_ten_milliseconds_after_the_cycle_that_follows_it(ahead_us, errors, bench):
-    bench.core.receive(bench.now_us + MS + ahead_us, 0x7FF, b"")
-    bench.step()
-    assert bench.core._core.clock_errors == errors
-
-
 def test_the_fault_passes_once_the_clock_is_sound_again():
     bench = driving()
     begin_us = bench.now_us
