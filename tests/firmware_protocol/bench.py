@@ -17,6 +17,15 @@ FAULTS = {name: value for value, name in CODEC.choices("SYSTEM_STATE", "fault").
 BLOCKERS = {name: value for value, name in CODEC.choices("SESSION_STATE", "blockers").items()}
 
 
+def transitions() -> list[tuple[tuple[str, ...], str, str]]:
+    """The rows of the table in C: the states that each leaves, the state that it leads to, the cause of the stop."""
+    states, causes = (CODEC.choices("SYSTEM_STATE", signal) for signal in ("state", "stop_cause"))
+    count = _firmware.ffi.new("size_t *")
+    rows = _firmware.lib.disco_transitions(count)[0 : count[0]]
+    leaves = [tuple(name for state, name in states.items() if getattr(row, "from") >> state & 1) for row in rows]
+    return [(left, states[row.to], causes[row.stop_cause]) for left, row in zip(leaves, rows, strict=True)]
+
+
 def sealed(can_id: int, body: bytes, major: int = 1) -> bytes:
     """Seven bytes with the CRC in front, made with the C core's function."""
     return bytes((_firmware.lib.disco_e2e_crc(b"\0" + body, data_id(can_id, major)),)) + body

@@ -8,9 +8,10 @@ import pytest
 from firmware_protocol import _firmware
 from firmware_protocol.build_firmware import PACKAGE
 from firmware_protocol.codec import PROTOCOL, Codec
-from firmware_protocol.protection import EncodedFrame, Prover, challenge_answer, crc8
+from firmware_protocol.protection import EncodedFrame, Prover, challenge_answer, crc8, data_id
 from firmware_protocol.serial_framing import encode_frame
 from firmware_protocol.status_codes import FAULTS
+from tests.firmware_protocol.bench import transitions
 
 TEXT = (Path(PACKAGE) / "README.md").read_text("utf-8")
 CODEC = Codec()
@@ -29,18 +30,7 @@ def test_frames_are_those_of_the_dbc():
 
 
 def test_states_are_those_of_the_c_table():
-    states = CODEC.choices("SYSTEM_STATE", "state")
-    count = ffi.new("size_t *")
-    table = lib.disco_transitions(count)
-    expected = [
-        (
-            [name for state, name in states.items() if getattr(table[i], "from") >> state & 1],
-            states[table[i].to],
-            CODEC.choice_name("SYSTEM_STATE", "stop_cause", table[i].stop_cause),
-        )
-        for i in range(count[0])
-    ]
-    assert [(row[0].split(", "), row[1], row[2]) for row in rows("States")] == expected
+    assert [(tuple(row[0].split(", ")), row[1], row[2]) for row in rows("States")] == transitions()
 
 
 def test_faults_are_those_of_the_table():
@@ -106,7 +96,7 @@ def test_vectors(label):
 )
 def test_vectors_without_major(label):
     data = documented(label)
-    assert data[0] == crc8(data[1:], 0x0110)
+    assert data[0] == crc8(data[1:], data_id(0x110, 0)) == lib.disco_e2e_crc(data, 0x0110)
 
 
 def test_linked_files_exist():

@@ -106,17 +106,11 @@ def test_the_emergency_stop_button_stops_the_wheels(host):
 
 
 def test_parameters_that_were_written_outlive_a_restart(host):
-    def request_parameter(**request):
-        host.latest.pop("PARAM_RESPONSE", None)
-        host.send("PARAM_REQUEST", **request)
-        host.wait_for("PARAM_RESPONSE", lambda: "PARAM_RESPONSE" in host.latest)
-        return host.latest["PARAM_RESPONSE"]["value"]
-
-    assert request_parameter(operation="READ", key=4, value=0.0) == 20.0
-    assert request_parameter(operation="WRITE", key=4, value=5.0) == 5.0
+    assert host.request_parameter("READ", key=4) == ("OK", 20.0)
+    assert host.request_parameter("WRITE", key=4, value=5.0) == ("OK", 5.0)
     host.run(0.1)
     host.restart()
-    assert request_parameter(operation="READ", key=4, value=0.0) == 5.0
+    assert host.request_parameter("READ", key=4) == ("OK", 5.0)
 
 
 def test_a_thousand_frames_of_garbage_move_nothing_and_leave_it_sound(host_at_a_terminal):

@@ -14,35 +14,30 @@ pytestmark = [
 ]
 
 
-class TestM3(FirmwareConformance):
+class EmulatedConformance(FirmwareConformance):
+    processor = "m3"
+    is_slcan = False
+
     @classmethod
     def create_end(cls, config):
-        return BoardEnd("m3")
+        return BoardEnd(cls.processor, key=cls.key, slcan=cls.is_slcan)
 
 
-class TestM4F(FirmwareConformance):
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m4f")
+class TestM3(EmulatedConformance):
+    pass
 
 
-class TestAuthenticatedM3(FirmwareConformance):
+class TestM4F(EmulatedConformance):
+    processor = "m4f"
+
+
+class TestAuthenticatedM3(TestM3):
     key = bytes(range(16))
 
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m3", key=cls.key)
 
-
-class TestAuthenticatedM4F(FirmwareConformance):
+class TestAuthenticatedM4F(TestM4F):
     key = bytes(range(16))
 
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m4f", key=cls.key)
 
-
-class TestSlcanM4F(FirmwareConformance):
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m4f", slcan=True)
+class TestSlcanM4F(TestM4F):
+    is_slcan = True
