@@ -72,14 +72,11 @@ def test_effects_of_size_nothing_leave_the_trajectory_bit_identical(baseline):
     assert is_same(recorded(**nothing), baseline) == (True, True, True, True)
 
 
-def test_pose_latency_shifts_the_measured_path_by_itself():
+def test_pose_latency_shifts_the_measured_path_by_itself_and_keeps_stamps():
     prompt, delayed = recorded(NOISELESS)[3], recorded(NOISELESS, pose_latency=0.12)[3]
     for now, then in zip(delayed[3:], prompt, strict=False):
         assert now.sample_us - then.sample_us == 120_000
         assert (now.x_m, now.y_m, now.yaw_rad) == (then.x_m, then.y_m, then.yaw_rad)
-
-
-def test_pose_latency_keeps_stamps_and_noise():
     prompt, delayed = recorded(NOISY)[3], recorded(NOISY, pose_latency=0.04)[3]
     assert [(m.sample_us, m.available_us) for m in prompt] == [(m.sample_us, m.available_us) for m in delayed]
 
@@ -219,7 +216,7 @@ def test_kidnapping_moves_the_body_and_not_the_wheels():
     assert abs(poses[-1].x_m - after.x_m) < 0.05
 
 
-def test_disabled_and_braked_wheels_come_to_rest():
+def test_disabled_and_braked_wheels_come_to_rest_and_time_does_not_go_back():
     plant = Plant(NOISELESS)
     plant.step(1_000_000, 5.0, 5.0)
     plant.step(4_000_000, 5.0, 5.0, enabled=False)
@@ -227,6 +224,8 @@ def test_disabled_and_braked_wheels_come_to_rest():
     plant.step(5_000_000, 5.0, 5.0)
     plant.step(5_300_000, 5.0, 5.0, brake=True)
     assert plant.truth.left_speed_rad_s == 0.0
+    with pytest.raises(ValueError, match="5300000 us"):
+        plant.step(5_299_000, 0.0, 0.0)
 
 
 def test_readings_follow_what_the_motors_do():
@@ -238,13 +237,6 @@ def test_readings_follow_what_the_motors_do():
     assert plant.electrics.battery.voltage_v < resting_v
     assert min(plant.electrics.motor_temperatures_c) > 22.0
     assert plant.measured_wheel_speeds_rad_s == pytest.approx((-6.0, 6.0), abs=0.1)
-
-
-def test_time_cannot_go_back():
-    plant = Plant()
-    plant.step(5000, 0.0, 0.0)
-    with pytest.raises(ValueError, match="5000 us"):
-        plant.step(4000, 0.0, 0.0)
 
 
 def test_wheel_disturbance_shows_in_ticks_and_in_the_pose():

@@ -270,9 +270,3 @@ def test_two_runs_with_one_seed_are_equal():
         setup.drive(3.0, 2.0, 500)
         runs.append((setup.frames, setup.robot.plant.truth))
     assert runs[0] == runs[1]
-
-
-def test_time_does_not_go_back(setup):
-    setup.run(10)
-    with pytest.raises(ValueError, match="cannot go back"):
-        setup.robot.step(9000)
