@@ -4,6 +4,7 @@ Tests marked `motion` turn the wheels, at 1.5 rad/s at most.
 """
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -52,6 +53,13 @@ class FirmwareConformance:
         return talk
 
     @pytest.fixture
+    def locked(self, host):
+        """Return the host of a robot in authenticated mode."""
+        if self.key is None:
+            pytest.skip("no key")
+        return host
+
+    @pytest.fixture
     def slack_s(self, talk):
         return talk.end.slack_s
 
@@ -83,8 +91,7 @@ class FirmwareConformance:
             frames = host.messages(name)
             assert 0.8 * 2.1 / period_s - 1 <= len(frames) <= 1.25 * 2.1 / period_s + 2, name
             counters = [decoded.counter for _, decoded in frames]
-            expected = [(counters[0] + i) % 16 for i in range(len(counters))]
-            assert counters == expected, name
+            assert all((after - before) % 16 == 1 for before, after in pairwise(counters)), name
         assert host.damaged == 0
 
     def test_speed_and_ticks_of_one_sample_share_their_counter(self, host):
@@ -308,42 +315,35 @@ class FirmwareConformance:
 
     # With a key.
 
-    def test_nothing_is_heard_without_proof(self, host):
-        if self.key is None:
-            pytest.skip("no key")
-        before = host.rejected
-        host.proves = False
-        host.set_request("READY", host.new_session())
-        host.run(0.8)
-        assert host.state == "STANDBY"
-        assert host.rejected != before
-        assert host.reject_reason == "AUTHENTICATION"
+    def test_nothing_is_heard_without_proof(self, locked):
+        before = locked.rejected
+        locked.proves = False
+        locked.set_request("READY", locked.new_session())
+        locked.run(0.8)
+        assert (locked.state, locked.reject_reason) == ("STANDBY", "AUTHENTICATION")
+        assert locked.rejected != before
 
-    def test_the_proof_of_another_key_is_none(self, host):
-        if self.key is None:
-            pytest.skip("no key")
-        right = host.prover
-        host.prover = Prover(bytes(byte ^ 1 for byte in self.key), CODEC)
-        host.prover.challenge(int(host.latest["MAC_CHALLENGE"]["nonce"]))
-        host.set_request("READY", host.new_session())
-        host.run(0.8)
-        host.prover = right
-        assert (host.state, host.reject_reason) == ("STANDBY", "AUTHENTICATION")
+    def test_the_proof_of_another_key_is_none(self, locked):
+        right = locked.prover
+        locked.prover = Prover(bytes(byte ^ 1 for byte in self.key), CODEC)
+        locked.prover.challenge(int(locked.latest["MAC_CHALLENGE"]["nonce"]))
+        locked.set_request("READY", locked.new_session())
+        locked.run(0.8)
+        locked.prover = right
+        assert (locked.state, locked.reject_reason) == ("STANDBY", "AUTHENTICATION")
 
-    def test_a_proved_frame_is_heard_once(self, host):
-        if self.key is None:
-            pytest.skip("no key")
-        host.request = None
-        frame = CODEC.encode("HOST_STATE", host.counter("HOST_STATE"), request="STANDBY", session=0, challenge_answer=0,
-                             host_fault=0)  # fmt: skip
-        proof = host.prover.prove(frame)
-        before = host.rejected
+    def test_a_proved_frame_is_heard_once(self, locked):
+        locked.request = None
+        standby = {"request": "STANDBY", "session": 0, "challenge_answer": 0, "host_fault": 0}
+        frame = CODEC.encode("HOST_STATE", locked.counter("HOST_STATE"), **standby)
+        proof = locked.prover.prove(frame)
+        before = locked.rejected
         for _ in range(3):
-            host.end.send(*proof)
-            host.end.send(*frame)
-            host.run(0.01)
-        host.run(0.15)
-        assert ((host.rejected - before) % 256, host.reject_reason) == (2, "AUTHENTICATION")
+            locked.end.send(*proof)
+            locked.end.send(*frame)
+            locked.run(0.01)
+        locked.run(0.15)
+        assert ((locked.rejected - before) % 256, locked.reject_reason) == (2, "AUTHENTICATION")
 
     # Motion.
 
