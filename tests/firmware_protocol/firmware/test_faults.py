@@ -49,17 +49,13 @@ THRESHOLDS = [
 def test_threshold_and_debounce(field, bad, good, fault, debounce_ms, bench):
     bench.inputs[field] = good
     assert bench.run(1100).fault == 0
-    bench.inputs[field] = bad
-    assert wait_for_fault(bench) == (fault, max(debounce_ms, 1))
-
-
-@pytest.mark.parametrize(("field", "bad", "good", "fault", "debounce_ms"), [row for row in THRESHOLDS if row[-1]])
-def test_a_shorter_disturbance_is_no_fault(field, bad, good, fault, debounce_ms, bench):
-    for _ in range(3):
+    for _ in range(3 if debounce_ms else 0):
         bench.inputs[field] = bad
         bench.run(debounce_ms - 1)
         bench.inputs[field] = good
-        assert bench.run(2).fault == 0, fault
+        assert bench.run(2).fault == 0, "a shorter disturbance is no fault"
+    bench.inputs[field] = bad
+    assert wait_for_fault(bench) == (fault, max(debounce_ms, 1))
 
 
 def test_time_counts_from_the_first_cycle_whatever_the_clock_shows_then():
