@@ -40,9 +40,10 @@ def raw_frame(body):
     return cobs.encode(body + crc16(body).to_bytes(2, "little")) + b"\0"
 
 
-def test_check_value_and_vector(encode_frame):
+def test_check_value_vector_and_longest_frame(encode_frame):
     assert crc16(b"123456789") == _firmware.lib.disco_crc16(b"123456789", 9) == 0x29B1
     assert encode_frame(*FRAMES[0]) == bytes.fromhex("030110050201020303924800")
+    assert len(encode_frame(0x7FF, b"\xff" * 8)) <= MAX_FRAME
 
 
 @thinned("every", [17, 1], quick=1)
@@ -172,10 +173,6 @@ def test_an_endless_frame_is_dropped_and_takes_no_memory(framing):
         assert len(decoder._pending) < MAX_FRAME
     assert decoder.feed(b"\0" + framing.encode_frame(1, b"")) == [(1, b"")]
     assert decoder.stats.length_errors == 1
-
-
-def test_longest_frame_has_a_place(encode_frame):
-    assert len(encode_frame(0x7FF, b"\xff" * 8)) <= MAX_FRAME
 
 
 @pytest.mark.parametrize(

@@ -314,8 +314,7 @@ def test_two_nodes_with_one_identifier_destroy_each_other():
     bus.advance(0)
     differs = next(i for i, (x, y) in enumerate(zip(stuffed_bits(one), stuffed_bits(other), strict=False)) if x != y)
     assert bus.next_event_ns() == (differs + 1 + 6 + 6 + 8) * BIT_NS
-    out = bus.advance(LONG_NS)
-    assert data_of(out) == []
+    assert data_of(bus.advance(LONG_NS)) == []
     assert (a.state, b.state) == (ErrorState.BUS_OFF, ErrorState.BUS_OFF)
 
 

@@ -146,8 +146,7 @@ def test_a_reader_that_never_reads_is_bounded_counted_and_reported(hub):
     for _ in range(100):
         frames += sleeper.received()
         pump(hub, now_ns)
-    numbers = [int.from_bytes(frame.data) for frame in frames]
-    assert numbers == list(range(2 * READER_QUEUE - dropped))
+    assert [int.from_bytes(frame.data) for frame in frames] == list(range(2 * READER_QUEUE - dropped))
     hub.bus.send(robot, FRAME)
     pump(hub, now_ns + LONG_NS)
     assert sleeper.received() == [CanFrame(0x004, b"\x00\x01\x00\x00\x00\x00\x00\x00", error=True), FRAME]

@@ -139,8 +139,7 @@ def test_late_poses_keep_their_stamps_and_their_order_and_none_is_lost():
 
 
 def test_a_silent_sensor_says_nothing():
-    faults = under("pose_silent")
-    assert faults.poses(0, [pose(0)]) == []
+    assert under("pose_silent").poses(0, [pose(0)]) == []
 
 
 MS = 1_000_000

@@ -264,21 +264,13 @@ def _blocks(parameters, seed, count):
     return np.concatenate(wheel), np.concatenate(slip)
 
 
-def test_standard_deviations_and_means_are_the_parameters():
+def test_disturbances_have_the_stated_size_and_correlation_time_and_are_independent():
     wheel, slip = _blocks(PARAMETERS, 1, 100)
     np.testing.assert_allclose(wheel.std(axis=0), 0.015, rtol=0.05)
     np.testing.assert_allclose(slip.std(axis=0), [0.005, 0.004, 0.018], rtol=0.07)
     assert np.all(np.abs(wheel.mean(axis=0)) < 0.1 * 0.015)
-
-
-def test_correlation_time_is_the_parameter():
-    wheel, slip = _blocks(PARAMETERS, 2, 100)
     for values, lag in ((wheel[:, 0], 15), (slip[:, 2], 30)):
         assert np.corrcoef(values[:-lag], values[lag:])[0, 1] == pytest.approx(np.exp(-1.0), abs=0.05)
-
-
-def test_sides_and_axes_are_independent():
-    wheel, slip = _blocks(PARAMETERS, 3, 100)
     together = np.corrcoef(np.hstack([wheel, slip]).T)
     assert np.all(np.abs(together - np.eye(5)) < 0.06)
 

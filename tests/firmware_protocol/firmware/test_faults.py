@@ -285,8 +285,7 @@ def test_a_reset_of_one_fault_hides_no_other_for_a_single_cycle(bench):
     bench.inputs.pop("left_current_a")
     bench.set_request("STANDBY").run(250)
     bench.set_request("RESET")
-    shown = {fault_after(bench, 1) for _ in range(60)}
-    assert shown == {"OVER_CURRENT_LEFT", "UNDER_VOLTAGE"}
+    assert {fault_after(bench, 1) for _ in range(60)} == {"OVER_CURRENT_LEFT", "UNDER_VOLTAGE"}
     assert (bench.out.state, bench.fault()) == ("STANDBY", "UNDER_VOLTAGE")
 
 

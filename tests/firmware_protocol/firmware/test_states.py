@@ -153,14 +153,10 @@ STOPS = [
 ]
 
 
-@pytest.mark.parametrize(("state", "name", "to"), STOPS)
-def test_stopping_needs_nothing_but_its_reason(state, name, to):
+@pytest.mark.parametrize(("state", "name", "to"), [("BOOT", "SELF_TEST_PASSED", "STANDBY"), *STOPS])
+def test_to_leave_boot_and_to_stop_needs_nothing_but_its_reason(state, name, to):
     assert next_state(state, condition(name)) == to
     assert next_state(state, 0) == state
-
-
-def test_boot_is_left_by_the_self_test_alone():
-    assert next_state("BOOT", condition("SELF_TEST_PASSED")) == "STANDBY"
 
 
 @pytest.mark.parametrize(("state", "to", "needs"), [("STANDBY", "READY", MAY_READY), ("READY", "ARMED", MAY_ARM)])

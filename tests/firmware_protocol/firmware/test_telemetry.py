@@ -167,15 +167,6 @@ def test_rejections_are_counted_modulo_256_with_the_newest_reason(bench):
     assert bench.out.rejected_frames == 300
 
 
-def test_last_command_counter_is_that_of_the_last_accepted_command():
-    bench = Bench.driving()
-    accepted = bench.counters["WHEEL_COMMAND"]
-    bench.command = None
-    bench.wheel_command(4.0, 2.0, session=9)
-    bench.set_request("STANDBY").run_until("STOPPING")
-    assert last(bench, "SYSTEM_STATE")["last_command_counter"] == accepted
-
-
 def test_session_state_tells_challenge_session_acceptance_and_blockers_and_the_end_of_a_session_at_once(bench):
     bench.run(105)
     assert sent_by_next_cycle(bench.hello(), "SESSION_STATE") == 1
