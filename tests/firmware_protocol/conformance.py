@@ -27,7 +27,7 @@ HELLO = CODEC.encode("HELLO_REQUEST", 0, protocol_major=1, protocol_minor=0, dbc
 
 def damaged(data, place):
     """Turn a bit of the byte at a place."""
-    return bytes(byte ^ 0x10 * (at == place) for at, byte in enumerate(data))
+    return data[:place] + bytes((data[place] ^ 0x10,)) + data[place + 1 :]
 
 
 class FirmwareConformance:
