@@ -16,21 +16,16 @@ import pytest
 
 from drivers.transport import serial
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
-from tests.firmware_protocol.emulated.board_end import BoardEnd
+from tests.firmware_protocol.emulated.board_end import EMULATED, BoardEnd
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
 from tests.sim.test_board import SimProcess
 from tests.sim.test_python_can_link import HubProcess, drive_with_another_node
-from tools.check.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
+from tools.check.emulated_board import build_board, run_fast, running_bare_board, running_board
 
 ROOT = Path(__file__).parents[3]
 ARMED = 3
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.hil,
-    pytest.mark.timeout(300),
-    pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
-]
+pytestmark = [*EMULATED, pytest.mark.timeout(300)]
 
 
 @contextlib.contextmanager

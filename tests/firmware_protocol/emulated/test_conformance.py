@@ -3,15 +3,9 @@
 import pytest
 
 from tests.firmware_protocol.conformance import FirmwareConformance
-from tests.firmware_protocol.emulated.board_end import BoardEnd
-from tools.check.emulated_board import missing
+from tests.firmware_protocol.emulated.board_end import EMULATED, BoardEnd
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.hil,
-    pytest.mark.timeout(300),
-    pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
-]
+pytestmark = [*EMULATED, pytest.mark.timeout(300)]
 
 
 class EmulatedConformance(FirmwareConformance):
