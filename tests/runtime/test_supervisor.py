@@ -17,22 +17,40 @@ def bench():
     return Bench()
 
 
+def bench_in(state):
+    return getattr(Bench(), state)()
+
+
 def refusal(out):
-    assert len(out.replies) == 1
-    assert not out.replies[0].accepted
-    return out.replies[0].text
+    (reply,) = out.replies
+    assert not reply.accepted
+    return reply.text
 
 
 # --- one test per row of the table -----------------------------------------------------------------------------------
 
+STARTS = ["ready", "armed", "running", "stopping"]
+NO_POSE = "no valid pose; check the pose sensor, or set estimation.pose_required = false"
+UNKNOWN_HEADING = (
+    "heading not known; the pose sensor measures none: drive one metre straight ahead by hand, on the page, to find it"
+)
+JUMP = "the pose jumped by 1.00 m and 0.10 rad, which the motion of the wheels does not explain"
+AFTER_JUMP = f"{JUMP}; check that the robot is where the page shows it, then start again"
 
-@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
-def test_a_link_that_is_down_means_disconnected_and_no_command(start):
-    bench = getattr(Bench(), start)()
-    out = bench.tick(link_state=LinkState.CONNECTING)
+
+@pytest.mark.parametrize("start", [*STARTS, "faulted"])
+@pytest.mark.parametrize(
+    ("loss", "event"),
+    [({"link_state": LinkState.CONNECTING}, "the link is down"), ({"link_generation": 2}, "the link was interrupted")],
+    ids=["down", "interrupted"],
+)
+def test_a_lost_link_means_disconnected_no_command_and_another_handshake(start, loss, event):
+    bench = bench_in(start)
+    out = bench.tick(**loss)
     assert out.state is State.DISCONNECTED
     assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
-    assert "link is down" in out.events[-1]
+    assert event in out.events[-1]
+    assert bench.tick(link_state=LinkState.UP, driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
 
 
 def test_without_a_link_it_says_why_and_what_to_do(bench):
@@ -47,16 +65,7 @@ def test_without_a_link_it_says_why_and_what_to_do(bench):
     assert bench.tick(driver_state=DriverState.HANDSHAKE, link_error=None).detail == "detail of the driver"
 
 
-@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping", "faulted"])
-def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
-    bench = getattr(Bench(), start)()
-    out = bench.tick(link_generation=2)
-    assert out.state is State.DISCONNECTED
-    assert (out.motion_allowed, out.zero_only, out.running) == (False, False, False)
-    assert bench.tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
-
-
-@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
+@pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
@@ -67,7 +76,7 @@ def test_a_link_interrupted_between_two_ticks_voids_the_session(start):
     ],
 )
 def test_a_problem_means_fault_in_words_without_motion(start, changes, expected):
-    bench = getattr(Bench(), start)()
+    bench = bench_in(start)
     out = bench.tick(**changes)
     assert out.state is State.FAULT
     assert out.driver_request is Request.STANDBY
@@ -99,9 +108,9 @@ def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_re
     assert refusal(bench.tick(ARM)).endswith(ending)
 
 
-@pytest.mark.parametrize("start", ["ready", "armed", "running", "stopping"])
+@pytest.mark.parametrize("start", STARTS)
 def test_estop_means_fault_in_the_same_tick_and_its_frames_until_the_robot_shows_it(start):
-    bench = getattr(Bench(), start)()
+    bench = bench_in(start)
     bench.robot_obeys = False
     out = bench.tick(ESTOP)
     assert out.state is State.FAULT
@@ -124,21 +133,16 @@ def test_reset_leads_from_fault_by_handshake_to_ready_and_not_to_armed():
     assert Request.ARM not in bench.requests_sent
 
 
-def test_disarm_stops_in_the_same_tick():
-    bench = Bench().running()
-    out = bench.tick(DISARM)
+@pytest.mark.parametrize(
+    ("requests", "changes", "zero_only"),
+    [([DISARM], {}, True), *(([], {"telemetry_age_s": age_s}, False) for age_s in (0.16, None, math.nan, math.inf))],
+    ids=["disarm", "late telemetry", "no telemetry", "nan", "inf"],
+)
+def test_a_disarm_stops_in_the_same_tick_and_lost_telemetry_stops_sending_too(requests, changes, zero_only):
+    out = Bench().running().tick(*requests, **changes)
     assert out.state is State.STOPPING
     assert out.driver_request is Request.STANDBY
-    assert out.zero_only
-    assert (out.motion_allowed, out.running) == (False, False)
-
-
-@pytest.mark.parametrize("age_s", [0.16, None, math.nan, math.inf])
-def test_lost_telemetry_disarms_and_stops_sending(age_s):
-    out = Bench().running().tick(telemetry_age_s=age_s)
-    assert out.state is State.STOPPING
-    assert out.driver_request is Request.STANDBY
-    assert (out.motion_allowed, out.zero_only) == (False, False)
+    assert (out.motion_allowed, out.zero_only, out.running) == (False, zero_only, False)
 
 
 @pytest.mark.parametrize("robot", [DriverState.STOPPING, DriverState.STANDBY, DriverState.READY, DriverState.HANDSHAKE])
@@ -152,24 +156,17 @@ def test_a_robot_that_stops_by_itself_ends_the_run(robot):
     assert Request.ARM not in bench.requests_sent[-50:]
 
 
+@pytest.mark.parametrize("start", ["connected", "ready"])
 @pytest.mark.parametrize("robot", [DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING])
-def test_a_robot_armed_unasked_is_stopped(robot):
-    out = Bench().ready().tick(driver_state=robot)
-    assert out.state is State.STOPPING
-    assert out.driver_request is Request.STANDBY
-
-
-def test_a_robot_found_armed_is_stopped(bench):
-    bench.tick(driver_state=DriverState.ARMED)
-    out = bench.tick(driver_state=DriverState.ARMED)
+def test_a_robot_armed_unasked_or_found_armed_is_stopped(start, robot):
+    out = bench_in(start).tick(driver_state=robot)
     assert out.state is State.STOPPING
     assert out.driver_request is Request.STANDBY
 
 
 @pytest.mark.parametrize("start", ["ready", "stopping"])
 def test_a_robot_that_restarts_begins_with_a_handshake(start):
-    bench = getattr(Bench(), start)()
-    assert bench.tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
+    assert bench_in(start).tick(driver_state=DriverState.HANDSHAKE).state is State.HANDSHAKE
 
 
 def test_lost_telemetry_while_ready_means_handshake():
@@ -228,73 +225,61 @@ def test_stale_telemetry_commands_zero_and_fresh_telemetry_continues():
     assert bench.tick(telemetry_age_s=0.01).motion_allowed
 
 
-def test_a_lost_pose_stops_the_task_for_good():
-    bench = Bench().running()
-    out = bench.tick(pose_ok=False)
+@pytest.mark.parametrize(
+    ("pose_required", "lost", "found", "reason"),
+    [
+        (True, {"pose_ok": False}, {"pose_ok": True}, NO_POSE),
+        (True, {"heading_missing": True}, {"heading_missing": False}, UNKNOWN_HEADING),
+        (False, {"heading_missing": True}, {"heading_missing": False}, UNKNOWN_HEADING),
+        (True, {"pose_jump": JUMP}, {"pose_jump": ""}, AFTER_JUMP),
+    ],
+    ids=["pose", "heading", "heading-no-pose-required", "jump"],
+)
+def test_without_a_reliable_pose_a_task_stops_for_good_and_none_is_started(pose_required, lost, found, reason):
+    bench = Bench(replace(SETTINGS, pose_required=pose_required)).running()
+    out = bench.tick(**lost)
     assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)
-    assert "no valid pose" in out.events[-1]
-    assert not bench.tick(pose_ok=True, count=10).motion_allowed
+    assert out.events[-1] == f"task stopped: {reason}"
+    # It is well again, and nobody has asked for motion again.
+    assert not bench.tick(**found, count=10).motion_allowed
+    assert refusal(bench.tick(START, **lost)) == reason
+    assert not bench.tick(count=5).motion_allowed
+    assert bench.tick(START, **found).motion_allowed
 
 
 def test_without_pose_required_the_task_runs_on_odometry():
-    bench = Bench(replace(SETTINGS, pose_required=False)).running()
-    assert bench.tick(pose_ok=False).motion_allowed
+    assert Bench(replace(SETTINGS, pose_required=False)).running().tick(pose_ok=False).motion_allowed
 
 
-@pytest.mark.parametrize("pose_required", [True, False])
-def test_without_a_heading_no_task_is_started_and_a_running_one_stops(pose_required):
-    bench = Bench(replace(SETTINGS, pose_required=pose_required)).armed()
-    out = bench.tick(START, heading_missing=True)
-    assert "heading not known" in refusal(out)
-    assert "drive one metre" in refusal(out)
-    assert not bench.tick(heading_missing=True, count=5).motion_allowed
-    running = Bench(replace(SETTINGS, pose_required=pose_required)).running()
-    out = running.tick(heading_missing=True)
-    assert (out.motion_allowed, out.zero_only) == (False, True)
-    assert "task stopped: heading not known" in out.events[-1]
-    assert not running.tick(heading_missing=False, count=5).motion_allowed
-
-
-def test_start_during_arming_is_dropped_where_the_heading_is_lost_meanwhile():
+@pytest.mark.parametrize(
+    "lost", [{}, {"pose_ok": False}, {"heading_missing": True}], ids=["nothing", "pose", "heading"]
+)
+def test_start_during_arming_starts_once_armed_unless_the_pose_is_lost_meanwhile(lost):
     bench = Bench().ready()
     bench.tick(ARM, START)
-    for _ in range(4):
-        assert not bench.tick(heading_missing=True).motion_allowed
-    assert not bench.tick(heading_missing=False, count=4).running
+    out = bench.tick(**lost, count=4)
+    assert (out.state, out.motion_allowed) == (State.ARMED, not lost)
+    assert bench.tick(pose_ok=True, heading_missing=False, count=4).running is not bool(lost)
 
 
 def test_ready_says_that_the_heading_is_missing():
     assert "drive one metre" in Bench().ready().tick(heading_missing=True).detail
 
 
-def test_by_hand_the_robot_moves_without_pose_and_heading():
-    bench = Bench().ready()
-    bench.tick(ARM, START, by_hand=True, heading_missing=True, pose_ok=False)
-    assert bench.tick(by_hand=True, heading_missing=True, pose_ok=False, count=4).motion_allowed
-
-
 @pytest.mark.parametrize("by_hand", [True, False])
 def test_who_started_by_hand_has_not_started_the_task_nor_the_other_way_round(by_hand):
     bench = Bench().ready()
     bench.tick(ARM, START, by_hand=by_hand)
-    assert bench.tick(by_hand=by_hand, count=4).motion_allowed
+    assert bench.tick(count=4).motion_allowed
     assert not bench.tick(by_hand=not by_hand).motion_allowed
     assert not bench.tick(by_hand=by_hand, count=5).motion_allowed
 
 
-def test_start_during_arming_starts_once_armed():
+@pytest.mark.parametrize("lost", [{"heading_missing": True, "pose_ok": False}, {"pose_jump": JUMP}])
+def test_by_hand_the_robot_is_started_and_moves_without_a_reliable_pose(lost):
     bench = Bench().ready()
-    bench.tick(ARM, START)
+    bench.tick(ARM, START, by_hand=True, **lost)
     assert bench.tick(count=4).motion_allowed
-
-
-def test_start_during_arming_is_dropped_when_the_pose_is_lost_meanwhile():
-    bench = Bench().ready()
-    bench.tick(ARM, START)
-    for _ in range(4):
-        assert not bench.tick(pose_ok=False).motion_allowed
-    assert bench.out.state is State.ARMED
-    assert not bench.tick(pose_ok=True, count=4).running
 
 
 @pytest.mark.parametrize("undo", [STOP, DISARM, ESTOP])
@@ -348,22 +333,16 @@ def test_disarm_during_arming_stops():
     assert bench.tick(count=50).state is State.READY
 
 
-def test_a_reset_without_effect_is_given_up_and_said():
+def test_a_reset_without_effect_is_given_up_and_said_and_an_estop_ends_it():
     bench = Bench().faulted()
     bench.robot_obeys = False
     bench.tick(RESET)
     assert bench.tick(count=149).driver_request is None
     assert bench.tick(count=2).driver_request is Request.STANDBY
     assert any("did not reset within 3 s: detail of the driver" in event for event in bench.events)
-
-
-def test_estop_during_a_reset_ends_the_reset():
-    bench = Bench().faulted()
-    bench.robot_obeys = False
     bench.tick(RESET)
     out = bench.tick(ESTOP)
-    assert out.state is State.FAULT
-    assert out.driver_request is Request.STANDBY
+    assert (out.state, out.driver_request) == (State.FAULT, Request.STANDBY)
 
 
 def test_after_a_disarm_the_robot_can_be_armed_again():
@@ -386,26 +365,25 @@ def test_estop_asked_while_disconnected_is_sent_when_the_link_is_up(bench):
 # --- refusals in words ------------------------------------------------------------------------------------------------
 
 
-def test_arm_is_refused_with_the_reason():
-    assert "link is connecting" in refusal(Bench().tick(ARM, link_state=LinkState.CONNECTING))
-    bench = Bench()
-    bench.robot_obeys = False
-    bench.tick()
-    assert "detail of the driver" in refusal(bench.tick(ARM))
-    assert "turning" in refusal(Bench().ready().tick(ARM, wheel_speed_rad_s=0.06))
-    assert "no recent wheel data" in refusal(Bench().ready().tick(ARM, telemetry_age_s=0.06))
-    assert "stopping" in refusal(Bench().stopping().tick(ARM))
-    assert "e-stop requested by the operator" in refusal(Bench().faulted().tick(ARM))
+@pytest.mark.parametrize(
+    ("start", "request_", "changes", "reason"),
+    [
+        ("connected", ARM, {"link_state": LinkState.CONNECTING}, "link is connecting"),
+        ("connected", ARM, {"driver_state": DriverState.HANDSHAKE}, "detail of the driver"),
+        ("ready", ARM, {"wheel_speed_rad_s": 0.06}, "turning"),
+        ("ready", ARM, {"telemetry_age_s": 0.06}, "no recent wheel data"),
+        ("stopping", ARM, {}, "stopping"),
+        ("faulted", ARM, {}, "e-stop requested by the operator"),
+        ("ready", START, {}, "arm it first"),
+        ("armed", START, {"telemetry_age_s": 0.06}, "no recent wheel data"),
+        ("ready", RESET, {}, "nothing to reset"),
+    ],
+)
+def test_a_request_is_refused_with_the_reason(start, request_, changes, reason):
+    assert reason in refusal(bench_in(start).tick(request_, **changes))
 
 
-def test_start_is_refused_with_the_reason():
-    assert "arm it first" in refusal(Bench().ready().tick(START))
-    assert "pose" in refusal(Bench().armed().tick(START, pose_ok=False))
-    assert "no recent wheel data" in refusal(Bench().armed().tick(START, telemetry_age_s=0.06))
-
-
-def test_reset_is_refused_with_the_reason():
-    assert "nothing to reset" in refusal(Bench().ready().tick(RESET))
+def test_a_reset_is_refused_while_a_check_fails_and_before_the_robot_shows_the_estop():
     bench = Bench().ready()
     bench.tick(preflight_errors=("limits differ",))
     assert "limits differ" in refusal(bench.tick(RESET))
@@ -496,46 +474,19 @@ def test_whatever_happens_motion_needs_everything(history):
 # --- recording -------------------------------------------------------------------------------------------------------
 
 
-def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for(bench):
-    bench.ready()
-    out = bench.tick(ARM, recording_fault="nothing is being recorded: no room")
-    assert refusal(out) == "nothing is being recorded: no room"
+def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for_and_not_stopped(bench):
+    fault = "nothing is being recorded: no room"
+    assert refusal(bench.ready().tick(ARM, recording_fault=fault)) == fault
     assert bench.tick(count=5).state is State.READY
     assert bench.tick(UserRequest.ARM_UNRECORDED).replies[0].accepted
     assert bench.tick(count=5).state is State.ARMED
-
-
-def test_a_recorder_that_fails_on_the_way_does_not_stop_the_robot(bench):
-    bench.running()
-    out = bench.tick(recording_fault="nothing is being recorded: no room", count=5)
+    out = Bench().running().tick(recording_fault=fault, count=5)
     assert (out.state, out.running) == (State.ARMED, True)
     assert bench.tick(ARM).replies[0].text == "already armed"
 
 
-@pytest.mark.parametrize("state", ["faulted", "stopping"])
-def test_to_arm_unrecorded_needs_all_else_that_arming_needs(state, bench):
-    getattr(bench, state)()
-    assert not bench.tick(UserRequest.ARM_UNRECORDED).replies[0].accepted
-    ready = Bench()
-    ready.ready()
-    assert not ready.tick(UserRequest.ARM_UNRECORDED, wheel_speed_rad_s=1.0).replies[0].accepted
-
-
-def test_a_pose_that_jumps_stops_the_task_and_refuses_a_start_while_it_does():
-    jump = "the pose jumped by 1.00 m and 0.10 rad, which the motion of the wheels does not explain"
-    reason = f"{jump}; check that the robot is where the page shows it, then start again"
-    bench = Bench().running()
-    out = bench.tick(pose_jump=jump)
-    assert (out.state, out.motion_allowed, out.zero_only) == (State.ARMED, False, True)
-    assert out.events[-1] == f"task stopped: {reason}"
-    # The jump is over, and nobody has asked for motion again.
-    assert not bench.tick(pose_jump="", count=10).motion_allowed
-    assert refusal(bench.tick(START, pose_jump=jump)) == reason
-    assert bench.tick(START, pose_jump="").motion_allowed
-
-
-def test_who_drives_by_hand_sees_a_jump_and_drives_on(bench):
-    bench.ready().tick(ARM)
-    bench.tick(count=3)
-    assert bench.tick(START, by_hand=True).motion_allowed
-    assert bench.tick(pose_jump="the pose jumped by 1.00 m").motion_allowed
+@pytest.mark.parametrize(
+    ("start", "changes"), [("faulted", {}), ("stopping", {}), ("ready", {"wheel_speed_rad_s": 1.0})]
+)
+def test_to_arm_unrecorded_needs_all_else_that_arming_needs(start, changes):
+    assert not bench_in(start).tick(UserRequest.ARM_UNRECORDED, **changes).replies[0].accepted
