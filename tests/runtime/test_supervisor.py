@@ -2,14 +2,12 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import strategies as st
 
-from disco_hw.runtime import TRANSITIONS, State
-from disco_hw.runtime.supervisor import Inputs, Supervisor, UserRequest
+from disco_hw.runtime import State
+from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import DriverState, LinkState, Request
 from firmware_protocol import status_codes
-from tests.runtime.supervisor_bench import ARM, DISARM, ESTOP, RESET, SETTINGS, START, STOP, TICK_NS, Bench
-from tests.tables import examples
+from tests.runtime.supervisor_bench import ARM, DISARM, ESTOP, RESET, SETTINGS, START, STOP, Bench
 
 
 @pytest.fixture
@@ -419,56 +417,6 @@ def test_asking_twice_is_harmless():
     assert bench.out.motion_allowed
     bench.tick(STOP, STOP, DISARM, DISARM)
     assert all(reply.accepted for reply in bench.out.replies)
-
-
-# --- whatever happens -------------------------------------------------------------------------------------------------
-
-ANY_INPUTS = st.builds(
-    Inputs,
-    link_state=st.sampled_from([LinkState.UP, LinkState.UP, LinkState.UP, LinkState.CONNECTING]),
-    link_generation=st.sampled_from([1, 1, 1, 1, 2]),
-    driver_state=st.sampled_from([*DriverState, *[DriverState.ARMED] * 6, *[DriverState.READY] * 4]),
-    driver_detail=st.just("words"),
-    telemetry_age_s=st.sampled_from([0.01, 0.01, 0.01, 0.1, 0.2, None, math.nan]),
-    wheel_speed_rad_s=st.sampled_from([0.0, 0.0, 1.0, math.nan]),
-    pose_ok=st.sampled_from([True, True, True, False]),
-    heading_missing=st.sampled_from([False, False, False, True]),
-    by_hand=st.sampled_from([False, False, True]),
-    requests=st.lists(st.sampled_from([ARM, ARM, START, START, *UserRequest]), max_size=3).map(tuple),
-)
-
-
-@examples(quick=80, every=300, history=st.lists(ANY_INPUTS, min_size=1, max_size=80))
-def test_whatever_happens_motion_needs_everything(history):
-    supervisor = Supervisor(SETTINGS)
-    armed_by_user = started_by_user = False
-    generation = None
-    for index, inputs in enumerate(history):
-        before = supervisor.state
-        out = supervisor.step(index * TICK_NS, inputs)
-        if inputs.link_state is not LinkState.UP or inputs.link_generation != generation:
-            armed_by_user = started_by_user = False
-        generation = inputs.link_generation if inputs.link_state is LinkState.UP else None
-        accepted = {reply.request for reply in out.replies if reply.accepted}
-        armed_by_user |= ARM in accepted
-        started_by_user |= START in accepted
-        assert not (out.motion_allowed and out.zero_only)
-        if out.motion_allowed:
-            assert out.state is State.ARMED
-            assert inputs.driver_state is DriverState.ARMED
-            assert inputs.telemetry_age_s <= SETTINGS.telemetry_zero_s
-            assert inputs.by_hand or (inputs.pose_ok and not inputs.heading_missing)
-            assert armed_by_user
-            assert started_by_user
-            assert not {DISARM, ESTOP} & set(inputs.requests)
-        if out.driver_request is Request.ARM:
-            assert ARM in accepted
-        if out.state is not before:
-            assert any(before in row.sources and row.target is out.state for row in TRANSITIONS)
-            assert out.events
-        assert len(out.replies) == len(inputs.requests)
-        assert all(reply.text for reply in out.replies)
-        assert out.detail
 
 
 # --- recording -------------------------------------------------------------------------------------------------------
