@@ -206,23 +206,6 @@ def test_stopping_lasts_until_the_robot_is_disarmed_and_the_wheels_are_still():
 # --- the task ---------------------------------------------------------------------------------------------------------
 
 
-def test_start_and_stop_switch_between_the_task_and_holding_zero():
-    bench = Bench().armed()
-    out = bench.tick(START)
-    assert (out.motion_allowed, out.zero_only, out.running) == (True, False, True)
-    out = bench.tick(STOP)
-    assert out.state is State.ARMED
-    assert (out.motion_allowed, out.zero_only, out.running) == (False, True, False)
-
-
-def test_stale_telemetry_commands_zero_and_fresh_telemetry_continues():
-    bench = Bench().running()
-    out = bench.tick(telemetry_age_s=0.06)
-    assert out.state is State.ARMED
-    assert (out.motion_allowed, out.zero_only) == (False, True)
-    assert bench.tick(telemetry_age_s=0.01).motion_allowed
-
-
 @pytest.mark.parametrize(
     ("pose_required", "lost", "found", "reason"),
     [
@@ -305,30 +288,18 @@ def test_arm_and_start_pending_at_a_link_loss_are_dropped_and_nothing_rearms(los
     assert Request.ARM not in bench.requests_sent
 
 
-def test_arming_that_the_robot_never_finishes_is_given_up():
-    bench = Bench().ready()
-    bench.robot_obeys = False
+def test_arming_that_the_robot_never_finishes_or_refuses_is_given_up(bench):
+    bench.ready().robot_obeys = False
     bench.tick(ARM)
     assert bench.tick(count=99, driver_state=DriverState.ARMING).detail == "arming"
     assert bench.tick(count=3).state is State.STOPPING
     assert any("the robot did not arm within 2 s: detail of the driver" in event for event in bench.events)
-
-
-def test_arming_that_the_robot_refuses_is_given_up_at_once():
-    bench = Bench().ready()
-    bench.robot_obeys = False
-    bench.tick(ARM)
-    bench.tick(driver_state=DriverState.ARMING)
-    assert bench.tick(driver_state=DriverState.READY).driver_request is Request.READY
-    assert any("did not arm: detail of the driver" in event for event in bench.events)
-
-
-def test_disarm_during_arming_stops():
-    bench = Bench().ready()
-    bench.tick(ARM)
-    out = bench.tick(DISARM)
-    assert out.state is State.STOPPING
-    assert bench.tick(count=50).state is State.READY
+    refusing = Bench().ready()
+    refusing.robot_obeys = False
+    refusing.tick(ARM)
+    refusing.tick(driver_state=DriverState.ARMING)
+    assert refusing.tick(driver_state=DriverState.READY).driver_request is Request.READY
+    assert any("did not arm: detail of the driver" in event for event in refusing.events)
 
 
 def test_a_reset_without_effect_is_given_up_and_said_and_an_estop_ends_it():
@@ -343,10 +314,12 @@ def test_a_reset_without_effect_is_given_up_and_said_and_an_estop_ends_it():
     assert (out.state, out.driver_request) == (State.FAULT, Request.STANDBY)
 
 
-def test_after_a_disarm_the_robot_can_be_armed_again():
-    bench = Bench().running()
-    bench.tick(DISARM)
-    bench.tick(count=5)
+@pytest.mark.parametrize("start", ["ready", "running"])
+def test_after_a_disarm_even_during_arming_the_robot_can_be_armed_again(start):
+    bench = bench_in(start)
+    bench.tick(ARM)
+    assert bench.tick(DISARM).state is State.STOPPING
+    assert bench.tick(count=50).state is State.READY
     bench.tick(ARM, START)
     assert bench.tick(count=5).motion_allowed
 
@@ -400,15 +373,24 @@ def test_estop_beats_arm_in_the_same_tick_in_either_order(order):
     assert Request.ARM not in bench.requests_sent
 
 
-def test_what_it_says_of_each_state(bench):
+def test_what_it_says_and_allows_in_each_step_of_a_drive(bench):
+    def seen(*requests, **changes):
+        out = bench.tick(*requests, **changes)
+        return out.state, out.detail, out.motion_allowed, out.zero_only
+
     assert bench.ready().out.detail == "ready to be armed"
     assert bench.tick(ARM).detail == "arming"
     bench.tick(count=3)
-    assert (bench.out.state, bench.out.detail) == (State.ARMED, "armed, commanding zero speed")
-    assert bench.tick(START).detail == "running the task"
-    assert bench.tick(telemetry_age_s=0.06).detail == "no recent wheel data from the robot: commanding zero speed"
-    assert bench.tick(telemetry_age_s=0.01).detail == "running the task"
-    assert bench.tick(STOP).detail == "armed, commanding zero speed"
+    holding = (State.ARMED, "armed, commanding zero speed", False, True)
+    running = (State.ARMED, "running the task", True, False)
+    assert seen() == holding
+    assert seen(START) == running
+    assert bench.out.running
+    stale = (State.ARMED, "no recent wheel data from the robot: commanding zero speed", False, True)
+    assert seen(telemetry_age_s=0.06) == stale
+    assert seen(telemetry_age_s=0.01) == running
+    assert seen(STOP) == holding
+    assert not bench.out.running
 
 
 def test_asking_twice_is_harmless():
