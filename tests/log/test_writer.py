@@ -38,7 +38,8 @@ def path(tmp_path):
 
 
 @pytest.fixture
-def recorder(path, forked_keepers):
+def recorder(path, request):
+    request.getfixturevalue("forked_keepers")
     return ProcessRecorder(recording(path))
 
 
@@ -142,8 +143,9 @@ def check_after_full_disk(path, stats, message):
 
 
 @pytest.fixture
-def full_disk(tmp_path, forked_keepers):
+def full_disk(tmp_path, request):
     """A full disk, a recorder whose writer has met it, its counters by then, and how many ticks were given."""
+    request.getfixturevalue("forked_keepers")
     with SmallDisk(tmp_path, 4160) as disk:
         # With 120 kB beside it; without it there is room for all that a slow machine has waiting by then.
         (disk / "filler").write_bytes(bytes(4040 * 1024))
