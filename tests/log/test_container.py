@@ -65,23 +65,18 @@ def sequences(data):
 
 
 CHUNKS = contents_of(COMPLETE_LOG).chunks
+THE_END_IS_MISSING = "the end is missing: the writer was killed or is still at work, or the file was cut"
 ALL_BUT_THE_FIFTH = [*range(1, 41), *range(51, 121)]
 
 
-def test_a_complete_file_is_read_by_its_index():
-    contents = contents_of(COMPLETE_LOG)
-    assert contents.complete
-    assert contents.damage == []
+@pytest.mark.parametrize(
+    ("data", "damage"), [(COMPLETE_LOG, []), (KILLED, [THE_END_IS_MISSING])], ids=["indexed", "walked"]
+)
+def test_a_complete_file_is_read_by_its_index_and_one_without_its_end_is_walked_and_says_so(data, damage):
+    contents = contents_of(data)
+    assert (contents.complete, contents.damage) == (not damage, damage)
     assert len(contents.chunks) == 12
-    assert sequences(COMPLETE_LOG) == list(range(1, 121))
-
-
-def test_a_file_without_its_end_is_walked_and_says_so():
-    contents = contents_of(KILLED)
-    assert not contents.complete
-    assert len(contents.damage) == 1
-    assert "the end is missing" in contents.damage[0]
-    assert sequences(KILLED) == list(range(1, 121))
+    assert sequences(data) == list(range(1, 121))
 
 
 def test_index_and_walk_agree():
@@ -225,10 +220,7 @@ def test_a_file_of_bombs_is_refused_chunk_by_chunk_without_unpacking_one():
     assert "a chunk that claims to be 1048576 bytes, packed in" in contents.damage[0]
     # What is wrong in hundreds of places is not reported one by one.
     assert len(contents.damage) == 102
-    assert contents.damage[-2:] == [
-        "at 400 further places something is lost",
-        "the end is missing: the writer was killed or is still at work, or the file was cut",
-    ]
+    assert contents.damage[-2:] == ["at 400 further places something is lost", THE_END_IS_MISSING]
 
 
 def test_a_chunk_may_be_packed_well(monkeypatch):
