@@ -12,8 +12,18 @@ from firmware_protocol.protection import PROVED, Prover, challenge_answer, data_
 MS = 1000
 CODEC = Codec()
 CONFIG = FirmwareConfig(ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+STATIONARY = FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0)
 FAULTS = {name: value for value, name in CODEC.choices("SYSTEM_STATE", "fault").items()}
 BLOCKERS = {name: value for value, name in CODEC.choices("SESSION_STATE", "blockers").items()}
+
+
+def transitions() -> list[tuple[tuple[str, ...], str, str]]:
+    """The rows of the table in C: the states that each leaves, the state that it leads to, the cause of the stop."""
+    states, causes = (CODEC.choices("SYSTEM_STATE", signal) for signal in ("state", "stop_cause"))
+    count = _firmware.ffi.new("size_t *")
+    rows = _firmware.lib.disco_transitions(count)[0 : count[0]]
+    leaves = [tuple(name for state, name in states.items() if getattr(row, "from") >> state & 1) for row in rows]
+    return [(left, states[row.to], causes[row.stop_cause]) for left, row in zip(leaves, rows, strict=True)]
 
 
 def sealed(can_id: int, body: bytes, major: int = 1) -> bytes:
@@ -73,6 +83,20 @@ class Bench:
         """Return a new bench that `to_driving` has brought to these wheel speeds (rad/s)."""
         return _brought_there("to_driving", config, left, right, start_us=start_us).copy()
 
+    @classmethod
+    def in_state(cls, state: str) -> "Bench":
+        """Return a new bench in this state: ARMED it drives, in FAULT and ESTOP it has never driven."""
+        bench = cls.ready() if state == "READY" else cls.driving() if state in ("ARMED", "STOPPING") else cls()
+        if state == "STOPPING":
+            bench.set_request("STANDBY").run_until("STOPPING")
+        elif state == "FAULT":
+            bench.inputs["left_current_a"] = 100.0
+            bench.run_until("FAULT")
+        elif state == "ESTOP":
+            bench.estop()
+        assert bench.out.state == state
+        return bench
+
     def next_counter(self, name: str) -> int:
         self.counters[name] = (self.counters.get(name, -1) + 1) % 16
         return self.counters[name]
@@ -95,6 +119,11 @@ class Bench:
         session = self.request["session"] if self.request else 0
         signals = {"mode": "SPEED", "left_speed": left, "right_speed": right, "valid_for": 0.1, "session": session}
         self.send("WHEEL_COMMAND", **signals | changes)
+
+    def estop(self):
+        """Send the emergency stop; return what the next cycle makes of it."""
+        self.core.receive(self.now_us, 0x080, b"")
+        return self.step()
 
     def step(self, elapsed_us: int | None = None):
         """Run one cycle after sending what the host has due: its state every 50 ms, its command every 20 ms."""
@@ -146,6 +175,12 @@ class Bench:
         self.request = {"request": request, "session": session} | changes
         return self
 
+    def to_standby(self) -> "Bench":
+        """Disarm, with no more commands."""
+        self.command = None
+        self.set_request("STANDBY").run_until("STANDBY")
+        return self
+
     def to_ready(self, session: int = 7) -> "Bench":
         self.hello()
         self.set_request("READY", session)
@@ -168,6 +203,9 @@ class Bench:
 
     def messages(self, name: str, since_us: int = 0) -> list[Decoded]:
         return [decoded for t_us, decoded in self.sent if decoded.name == name and t_us >= since_us]
+
+    def fault(self) -> str:
+        return CODEC.choice_name("SYSTEM_STATE", "fault", self.out.fault)
 
     def blockers(self) -> set[str]:
         return {name for name, bit in BLOCKERS.items() if self.out.blockers & bit}

@@ -1,8 +1,7 @@
 """The C side of the serial framing and of SLCAN, with the faces of Python's."""
 
-from dataclasses import dataclass
-
 from firmware_protocol import _firmware
+from firmware_protocol.serial_framing import FrameDecoderStats
 
 lib, ffi = _firmware.lib, _firmware.ffi
 
@@ -22,18 +21,13 @@ def encode_frame(can_id, data):
     return bytes(line[0:count])
 
 
-@dataclass
-class Stats:
-    frames: int
-    stuffing_errors: int
-    crc_errors: int
-    length_errors: int
-    unknown_kind: int
-    bytes: int
-
-    @property
-    def malformed(self):
-        return self.stuffing_errors + self.crc_errors + self.length_errors + self.unknown_kind
+def received(feed, state, line):
+    """The frames that C takes from these bytes."""
+    frames, frame = [], ffi.new("disco_frame_t *")
+    for byte in line:
+        if feed(state, byte, frame):
+            frames.append((frame.can_id, bytes(frame.data)[: frame.length]))
+    return frames
 
 
 class FrameDecoder:
@@ -42,13 +36,9 @@ class FrameDecoder:
         self._bytes = 0
         lib.disco_serial_init(self._decoder)
 
-    def feed(self, received):
-        frames, frame = [], ffi.new("disco_frame_t *")
-        for byte in received:
-            self._bytes += 1
-            if lib.disco_serial_feed(self._decoder, byte, frame):
-                frames.append((frame.can_id, bytes(frame.data)[: frame.length]))
-        return frames
+    def feed(self, line):
+        self._bytes += len(line)
+        return received(lib.disco_serial_feed, self._decoder, line)
 
     @property
     def _pending(self):
@@ -57,7 +47,9 @@ class FrameDecoder:
     @property
     def stats(self):
         d = self._decoder
-        return Stats(d.frames, d.stuffing_errors, d.crc_errors, d.length_errors, d.unknown_kind, self._bytes)
+        return FrameDecoderStats(
+            d.frames, self._bytes, d.stuffing_errors, d.crc_errors, d.length_errors, d.unknown_kind
+        )
 
 
 class Slcan:
@@ -67,10 +59,7 @@ class Slcan:
 
     def feed(self, text):
         """Return the frames that were for the robot, and the replies."""
-        frames, frame = [], ffi.new("disco_frame_t *")
-        for byte in text:
-            if lib.disco_slcan_feed(self.line, byte, frame):
-                frames.append((frame.can_id, bytes(frame.data)[: frame.length]))
+        frames = received(lib.disco_slcan_feed, self.line, text)
         replies = ffi.new("uint8_t[22]")
         return frames, bytes(replies[0 : lib.disco_slcan_reply(self.line, replies)])
 

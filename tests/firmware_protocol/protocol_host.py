@@ -1,5 +1,6 @@
 """The host that the conformance suite plays: by the book, or against it, as a test wants."""
 
+import contextlib
 import itertools
 
 from firmware_protocol.codec import PROTOCOL_MAJOR, PROTOCOL_MINOR, Codec, Decoded
@@ -9,6 +10,11 @@ STATE_PERIOD_NS = 50_000_000
 COMMAND_PERIOD_NS = 20_000_000
 CODEC = Codec()
 _BLOCKERS = CODEC.choices("SESSION_STATE", "blockers")
+
+
+def _system_state(signal):
+    """A property: the name of what the last SYSTEM_STATE has in a signal."""
+    return property(lambda self: self._choice("SYSTEM_STATE", signal))
 
 
 class ProtocolHost:
@@ -36,21 +42,11 @@ class ProtocolHost:
         self._counters = {}
         self._due = {"request": 0, "command": 0}
 
-    @property
-    def state(self):
-        return self._choice("SYSTEM_STATE", "state")
-
-    @property
-    def fault(self):
-        return self._choice("SYSTEM_STATE", "fault")
-
-    @property
-    def stop_cause(self):
-        return self._choice("SYSTEM_STATE", "stop_cause")
-
-    @property
-    def reject_reason(self):
-        return self._choice("SYSTEM_STATE", "reject_reason")
+    state = _system_state("state")
+    fault = _system_state("fault")
+    stop_cause = _system_state("stop_cause")
+    reject_reason = _system_state("reject_reason")
+    estop_source = _system_state("estop_source")
 
     @property
     def rejected(self):
@@ -194,11 +190,39 @@ class ProtocolHost:
 
     def _device_ahead_us(self):
         """How far the robot's clock is ahead of this host's."""
+        _, _, device_us = self.request_time(self.end.now_ns // 1_000_000 % 256)
+        return device_us - self.end.now_ns // 1000
+
+    def request_time(self, sequence):
+        """Ask for the controller's time; return when that was sent and when it was answered (ns), and the time (us)."""
         self.latest.pop("TIME_RESPONSE", None)
-        sequence = self.end.now_ns // 1_000_000 % 256
+        sent_ns = self.end.now_ns
         self.send("TIME_REQUEST", sequence=sequence)
         self.wait_for("TIME_RESPONSE", lambda: self.latest.get("TIME_RESPONSE", {}).get("sequence") == sequence)
-        return int(self.latest["TIME_RESPONSE"]["receive_time"]) - self.end.now_ns // 1000
+        received_ns, response = self.messages("TIME_RESPONSE")[-1]
+        return sent_ns, received_ns, int(response.values["receive_time"])
+
+    def request_parameter(self, operation, key, value=0.0):
+        """Read or write a parameter; return the status and the value of the answer."""
+        self.latest.pop("PARAM_RESPONSE", None)
+        self.send("PARAM_REQUEST", operation=operation, key=key, value=value)
+        self.wait_for("PARAM_RESPONSE", lambda: "PARAM_RESPONSE" in self.latest)
+        return self._choice("PARAM_RESPONSE", "status"), self.latest["PARAM_RESPONSE"]["value"]
+
+    @contextlib.contextmanager
+    def recorded(self):
+        """Give a list to which what is sent within the block is added: (time in ns, CAN id, data)."""
+        sent, send = [], self.end.send
+
+        def record(can_id, data):
+            sent.append((self.end.now_ns, can_id, data))
+            send(can_id, data)
+
+        self.end.send = record
+        try:
+            yield sent
+        finally:
+            self.end.send = send
 
     def settle(self):
         """Bring the robot to STANDBY, accepted, still, without fault or emergency stop, whatever was before."""

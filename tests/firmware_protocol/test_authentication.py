@@ -49,17 +49,13 @@ def test_published_vectors(length, tag):
     assert aes_cmac(RFC_KEY, message).hex() == c_cmac(RFC_KEY, message).hex() == tag
 
 
-def test_published_subkeys():
+def test_published_subkeys_and_the_key_schedule_of_fips_197():
+    """FIPS 197, appendix A.1: the first and the last word made of the key."""
     c = c_key(RFC_KEY)
     assert bytes(c.whole).hex() == "fbeed618357133667c85e08f7236a8de"
     assert bytes(c.padded).hex() == "f7ddac306ae266ccf90bc11ee46d513b"
-
-
-def test_the_key_schedule_is_fips_197s():
-    """FIPS 197, appendix A.1: the first and the last word made of the key."""
-    schedule = bytes(c_key(RFC_KEY).round_keys)
-    assert schedule[16:20].hex() == "a0fafe17"
-    assert schedule[-4:].hex() == "b6630ca6"
+    assert bytes(c.round_keys)[16:20].hex() == "a0fafe17"
+    assert bytes(c.round_keys)[-4:].hex() == "b6630ca6"
 
 
 @examples(quick=60, every=100, key=st.binary(min_size=16, max_size=16), message=st.binary(max_size=80))
@@ -104,6 +100,13 @@ def prover_for(c):
 def c_holds(c, index, proof, frame):
     lib.disco_authentication_offer(c, index, proof.data)
     return lib.disco_authentication_holds(c, index, frame.can_id, frame.data)
+
+
+def command_holds(c, freshness):
+    """Whether COMMAND is taken with a proof of this freshness, of which a proof carries the low 16 bits."""
+    mac = truncated_mac(RFC_KEY, bytes(c.nonce), freshness, COMMAND)
+    proof = EncodedFrame(0x0F0, (freshness & 0xFFFF).to_bytes(2, "little") + mac)
+    return c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, proof, COMMAND)
 
 
 def test_the_nonce_is_a_mac_of_entropy_and_count():
@@ -155,33 +158,26 @@ def test_every_bit_of_frame_and_proof_matters(name):
 
 def test_a_proof_of_another_key_nonce_or_kind_is_none():
     c = c_authentication()
-    frame = EncodedFrame(0x100, COMMAND.data)
-    proof = prover_for(c).prove(frame)
-    assert not c_holds(c_authentication(key=bytes(16)), 0, proof, frame)
-    assert not c_holds(c_authentication(entropy=2), 0, proof, frame)
+    proof = prover_for(c).prove(COMMAND)
+    assert not c_holds(c_authentication(key=bytes(16)), 0, proof, COMMAND)
+    assert not c_holds(c_authentication(entropy=2), 0, proof, COMMAND)
     lib.disco_authentication_renew(c)
-    assert not c_holds(c, 0, proof, frame)
+    assert not c_holds(c, 0, proof, COMMAND)
 
 
 @pytest.mark.parametrize("dropped", [0, 1, 2, 0x7FFF, 0xFFFF - 1])
 def test_lost_frames_do_no_harm_up_to_what_the_low_bits_can_tell(dropped):
     c = c_authentication()
-    nonce = bytes(c.nonce)
     for freshness in (1, 2 + dropped, 3 + 2 * dropped, 4 + 3 * dropped):
-        mac = truncated_mac(RFC_KEY, nonce, freshness, COMMAND)
-        proof = EncodedFrame(0x0F0, (freshness & 0xFFFF).to_bytes(2, "little") + mac)
-        assert c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, proof, COMMAND)
+        assert command_holds(c, freshness)
         assert c.proofs[0].freshness == freshness
 
 
 def test_a_proof_from_behind_is_none_however_far():
     c = c_authentication()
-    nonce = bytes(c.nonce)
     c.proofs[0].freshness = 2**33 + 5
-    for freshness, fresh in ((2**33 + 5, False), (2**33 + 4, False), (6, False), (2**33 + 6, True)):
-        mac = truncated_mac(RFC_KEY, nonce, freshness, COMMAND)
-        proof = EncodedFrame(0x0F0, (freshness & 0xFFFF).to_bytes(2, "little") + mac)
-        assert c_holds(c, lib.DISCO_PROOF_WHEEL_COMMAND, proof, COMMAND) == fresh
+    for freshness, is_fresh in ((2**33 + 5, False), (2**33 + 4, False), (6, False), (2**33 + 6, True)):
+        assert command_holds(c, freshness) == is_fresh
 
 
 def test_the_counters_of_the_kinds_are_their_own():
@@ -195,13 +191,10 @@ def test_the_counters_of_the_kinds_are_their_own():
 
 
 def test_the_same_nonce_again_does_not_start_the_counters_anew():
-    prover = Prover(RFC_KEY, CODEC)
-    prover.challenge(5)
-    proofs = [prover.prove(COMMAND)]
-    prover.challenge(5)
-    proofs.append(prover.prove(COMMAND))
-    prover.challenge(6)
-    proofs.append(prover.prove(COMMAND))
+    prover, proofs = Prover(RFC_KEY, CODEC), []
+    for nonce in (5, 5, 6):
+        prover.challenge(nonce)
+        proofs.append(prover.prove(COMMAND))
     assert [proof.data[0] for proof in proofs] == [1, 2, 1]
     assert len({proof.data[2:] for proof in proofs}) == 3
 

@@ -46,26 +46,19 @@ def test_a_restart_that_was_none_is_told():
 
 
 class TestCore(FirmwareConformance):
+    core = CONFIG
+
     @classmethod
     def create_end(cls, config):
-        return SimulatedEnd(ReferenceRobot(), restarted(CONFIG))
+        core = replace(cls.core, key=cls.key or b"")
+        return SimulatedEnd(ReferenceRobot(core), restarted(core))
 
 
-class TestAuthenticatedCore(FirmwareConformance):
+class TestAuthenticatedCore(TestCore):
     key = bytes(range(16))
 
-    @classmethod
-    def create_end(cls, config):
-        config_with_key = replace(CONFIG, key=cls.key)
-        return SimulatedEnd(ReferenceRobot(config_with_key), restarted(config_with_key))
 
-
-class TestSlowCore(FirmwareConformance):
+class TestSlowCore(TestAuthenticatedCore):
     """A robot that can go at less than the suite's 1.5 rad/s, and takes its time to."""
 
-    key = bytes(range(16))
-
-    @classmethod
-    def create_end(cls, config):
-        slow = replace(CONFIG, key=cls.key, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)
-        return SimulatedEnd(ReferenceRobot(slow), restarted(slow))
+    core = replace(CONFIG, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)

@@ -21,55 +21,48 @@ def test_every_code_of_the_dbc_has_a_row_and_no_other():
     assert all(name == fault.name and fault.hint for name, fault in FAULTS.items())
 
 
-def bad_input(field, value):
-    """A cause that lies in one measurement, and its end."""
+def disturbed(disturb, end=lambda bench: bench.inputs.clear()):
+    """Return how a fault begins in a robot that drives, and how its cause ends."""
 
     def begin():
-        bench = Bench.driving()
-        bench.inputs[field] = value
+        bench = Bench.driving(4.0, 4.0)
+        disturb(bench)
         return bench
 
-    return begin, lambda bench: bench.inputs.clear()
+    return begin, end
+
+
+def bad_input(field, value):
+    """A cause that lies in one measurement."""
+    return disturbed(lambda bench: bench.inputs.update({field: value}))
 
 
 def dead_wheel(side, current_a):
     """A driven wheel without ticks."""
 
-    def begin():
-        bench = Bench.driving(4.0, 4.0)
+    def disturb(bench):
         bench.inputs.update({f"{side}_current_a": current_a, f"{side}_ticks": int(bench.ticks[side == "right"])})
-        return bench
 
-    return begin, lambda bench: bench.inputs.clear()
+    return disturbed(disturb)
 
 
 def jump(side):
-    def begin():
-        bench = Bench.driving()
+    def disturb(bench):
         bench.ticks[side] += 5000
-        return bench
 
-    return begin, lambda bench: None
+    return disturbed(disturb)
 
 
 def turned_round(side):
-    def begin():
-        bench = Bench.driving(4.0, 4.0)
+    def disturb(bench):
         bench.wheels_follow = False
         bench.speeds[side] = -3.0
-        return bench
 
-    def end(bench):
-        bench.wheels_follow = True
-
-    return begin, end
+    return disturbed(disturb, lambda bench: setattr(bench, "wheels_follow", True))
 
 
 def stranger(**changes):
-    def begin():
-        return Bench().hello(**changes)
-
-    return begin, lambda bench: bench.hello()
+    return lambda: Bench().hello(**changes), lambda bench: bench.hello()
 
 
 def started_by(cause):
@@ -81,12 +74,6 @@ def started_by(cause):
     return Started, lambda bench: None
 
 
-def leapt_clock():
-    bench = Bench.driving()
-    bench.step(50 * MS)
-    return bench
-
-
 PROVOKED = {
     "UNDER_VOLTAGE": bad_input("voltage_v", 12.0),
     "OVER_VOLTAGE": bad_input("voltage_v", 40.0),
@@ -94,7 +81,7 @@ PROVOKED = {
     "SELF_TEST_FAILED": bad_input("self_test_failed", True),
     "DBC_HASH_MISMATCH": stranger(dbc_hash=1),
     "PROTOCOL_MAJOR_MISMATCH": stranger(protocol_major=99),
-    "CLOCK_MISMATCH": (leapt_clock, lambda bench: None),
+    "CLOCK_MISMATCH": disturbed(lambda bench: bench.step(50 * MS)),
     "CONFIG_INVALID": (lambda: Bench(replace(CONFIG, max_wheel_speed_rad_s=-1.0)), lambda bench: None),
     "ENTROPY_INVALID": (lambda: Bench(entropy=0), lambda bench: None),
     "WATCHDOG_RESET": started_by(ResetCause.WATCHDOG),

@@ -33,6 +33,12 @@ def read_until(board_end, end):
 OPENED = b"O\rO\r"
 
 
+def opened():
+    line = Slcan()
+    line.feed(b"O\r")
+    return line
+
+
 @pytest.fixture
 def host():
     """python-can on a terminal, the board's line, and the end of the terminal that the board has."""
@@ -72,8 +78,7 @@ def test_frames_pass_in_both_directions(host, can_id, data):
 
 @examples(quick=60, every=100, can_id=st.integers(0, 0x7FF), data=st.binary(max_size=8))
 def test_the_text_is_lawicels(can_id, data):
-    line = Slcan()
-    line.feed(b"O\r")
+    line = opened()
     text = f"t{can_id:03X}{len(data)}{data.hex().upper()}\r".encode()
     assert line.encode(can_id, data) == text
     assert line.feed(text) == ([(can_id, data)], b"\r")
@@ -88,8 +93,7 @@ def test_the_text_is_lawicels(can_id, data):
      b"t" * 28, b"O" * 200],
 )  # fmt: skip
 def test_nonsense_is_answered_with_a_bell_and_counted(text):
-    line = Slcan()
-    line.feed(b"O\r")
+    line = opened()
     assert line.feed(text + b"\r") == ([], b"\a")
     assert (line.line.errors, line.line.frames) == (1, 0)
     assert line.feed(b"t1000\r") == ([(0x100, b"")], b"\r")
@@ -101,8 +105,7 @@ def test_nonsense_is_answered_with_a_bell_and_counted(text):
      (b"T000001238" + b"0" * 16, b"\r"), (b"r1000", b"\r"), (b"R000001230", b"\r")],
 )  # fmt: skip
 def test_commands_are_answered(text, reply):
-    line = Slcan()
-    line.feed(b"O\r")
+    line = opened()
     assert line.feed(text + b"\r") == ([], reply)
     assert line.line.frames == 0
 
@@ -111,8 +114,7 @@ def test_commands_are_answered(text, reply):
     ("opens", "receives", "speaks"), [(b"C\r", False, False), (b"L\r", True, False), (b"O\r", True, True)]
 )
 def test_a_channel_that_is_closed_passes_nothing_and_one_that_listens_does_not_speak(opens, receives, speaks):
-    line = Slcan()
-    line.feed(b"O\r")
+    line = opened()
     line.feed(opens)
     assert (line.encode(0x100, b"") != b"") == receives
     frame = [(0x100, b"")] if speaks else []

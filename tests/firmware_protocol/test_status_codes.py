@@ -23,8 +23,7 @@ def table(message, signal):
 def test_every_code_of_the_dbc_has_a_sentence(message, signal, describe):
     names = table(message, signal)
     assert names
-    sentences = {describe(name) for name in names}
-    assert len(sentences) >= len(names) - 2
+    assert len({describe(name) for name in names}) >= len(names) - 2
     for name in names:
         assert describe(name) not in (name, describe("NO_SUCH_CODE")), name
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ import pytest
 from disco_hw.log import writer
 from disco_hw.log.process_recorder import RecordingSettings
 from disco_hw.log.reader import open_log
+from tests.drivers import waiting
 from tools.log_samples import ATTACHMENTS, tick
 
 _RECORD = """
@@ -47,11 +49,7 @@ def recorded_ticks(path):
         return [entry.tick for entry in log.records(("/loop",))]
 
 
-def wait_until(condition, timeout_s=60.0):
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "waited in vain"
-        time.sleep(0.01)
+wait_until = partial(waiting.wait_until, timeout_s=60.0)
 
 
 @contextmanager

@@ -39,21 +39,26 @@ def drive(tmp_path):
         return drive_from_log(log)
 
 
-def test_what_is_exported_comes_back_to_the_last_bit(drive, tmp_path):
-    path = tmp_path / "run.csv"
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.csv"
+
+
+def test_what_is_exported_comes_back_to_the_last_bit(drive, path):
     count = write_csv(drive, path, TICKS)
     back = read_csv(path, ticks_per_rev=TICKS, wheel_radius_m=0.06)
-    for name in ("t_s", "left_speed_rad_s", "right_speed_rad_s", "segment"):
-        assert np.array_equal(getattr(back.wheels, name), getattr(drive.wheels, name)), name
-    assert np.array_equal(back.wheels.left_angle_rad, drive.wheels.left_angle_rad)
-    for name in ("t_s", "x_m", "y_m", "yaw_rad", "segment"):
-        assert np.array_equal(getattr(back.poses, name), getattr(drive.poses, name)), name
+    columns = {
+        "wheels": ("t_s", "left_speed_rad_s", "right_speed_rad_s", "left_angle_rad", "segment"),
+        "poses": ("t_s", "x_m", "y_m", "yaw_rad", "segment"),
+    }
+    for part, names in columns.items():
+        for name in names:
+            assert np.array_equal(getattr(getattr(back, part), name), getattr(getattr(drive, part), name)), name
     assert drive.segments == back.segments == 2
     assert count == np.unique(np.concatenate([drive.commands.t_s, drive.wheels.t_s, drive.poses.t_s])).size
 
 
-def test_the_command_in_force_is_the_same_at_every_time(drive, tmp_path):
-    path = tmp_path / "run.csv"
+def test_the_command_in_force_is_the_same_at_every_time(drive, path):
     write_csv(drive, path, TICKS)
     back = read_csv(path, ticks_per_rev=TICKS)
 
@@ -64,8 +69,7 @@ def test_the_command_in_force_is_the_same_at_every_time(drive, tmp_path):
         assert in_force(back.commands, t_s) == in_force(drive.commands, t_s)
 
 
-def test_nothing_is_written_where_nothing_was_in_force(drive, tmp_path):
-    path = tmp_path / "run.csv"
+def test_nothing_is_written_where_nothing_was_in_force(drive, path):
     write_csv(drive, path, None)
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -76,8 +80,7 @@ def test_nothing_is_written_where_nothing_was_in_force(drive, tmp_path):
     assert any(row["pose_x_m"] == "" for row in rows)
 
 
-def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, tmp_path):
-    path = tmp_path / "run.csv"
+def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, path, tmp_path):
     path.write_text("precious", encoding="utf-8")
     with pytest.raises(LogError, match="already exists"):
         write_csv(drive, path, None)
@@ -86,7 +89,7 @@ def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, tmp_path):
     assert path.read_text(encoding="utf-8") == "precious"
 
 
-def test_a_full_disk_leaves_no_half_table_behind(drive, tmp_path):
+def test_a_full_disk_leaves_no_half_table_behind(drive, path):
     with files_of_at_most(2_000), pytest.raises(LogError, match="File too large"):
-        write_csv(drive, tmp_path / "run.csv", None)
-    assert not (tmp_path / "run.csv").exists()
+        write_csv(drive, path, None)
+    assert not path.exists()

@@ -1,15 +1,7 @@
 import numpy as np
 import pytest
 
-from disco_hw.log.drive import (
-    Commands,
-    DriveLog,
-    Poses,
-    Wheels,
-    concatenate,
-    differentiate_angle,
-    integrate_angle,
-)
+from disco_hw.log.drive import Commands, DriveLog, Poses, Wheels, concatenate, differentiate_angle, integrate_angle
 
 
 def zeros(count):
@@ -46,21 +38,18 @@ def test_drives_follow_each_other_without_touching():
     assert joined.wheels.angle_measured
 
 
-def test_one_drive_stays_as_it_is():
+def test_one_drive_stays_as_it_is_and_none_is_empty():
     one = drive("a", 5.0)
     joined = concatenate([one])
     assert np.array_equal(joined.poses.yaw_rad, one.poses.yaw_rad)
     assert joined.end_s == one.end_s == 5.0
+    empty = DriveLog((), Commands(), Wheels(), Poses())
+    assert (empty.end_s, empty.segments) == (0.0, 0)
 
 
 def test_a_drive_without_wheels_does_not_change_how_they_were_measured():
     assert concatenate([drive("a", 5.0), drive("b", 5.0, wheels=False)]).wheels.angle_measured
     assert not concatenate([drive("b", 5.0, wheels=False)]).wheels.angle_measured
-
-
-def test_an_empty_drive():
-    empty = DriveLog((), Commands(), Wheels(), Poses())
-    assert (empty.end_s, empty.segments) == (0.0, 0)
 
 
 def test_angle_and_speed_undo_each_other():

@@ -31,10 +31,8 @@ def cut(tmp_path):
 
 def test_info_says_what_a_log_holds(log):
     text = info(log, as_json=False)
-    assert "wombot" in text
-    assert "100 ticks, 0 missing; ended properly" in text
-    assert "/wheels" in text
-    assert "attached: robot.toml" in text
+    for part in ("wombot", "100 ticks, 0 missing; ended properly", "/wheels", "attached: robot.toml"):
+        assert part in text
     assert "lost" not in text
     summary = json.loads(info(log, as_json=True))
     assert summary["topics"]["/wheels"]["count"] == 100
@@ -45,13 +43,13 @@ def test_info_says_which_controller_answered_and_who_says_its_limits(tmp_path):
     agilex = Controller(5, "AgileX base", "", "", "robot.toml", fixed={"command_timeout_s": 0.5}, declared={"x_m": 2.0})
     later = structs.replace(agilex, t_ns=9, said_by="oracle")
     ticks = [(PERIOD_NS, [*tick(1), agilex]), (2 * PERIOD_NS, [*tick(2), structs.replace(agilex, t_ns=6), later])]
-    lines = [line for line in info(write_log(tmp_path / "run.mcap", ticks), False).splitlines() if "AgileX" in line]
-    assert lines[0] == (
+    text = info(write_log(tmp_path / "run.mcap", ticks), False)
+    first, second = (line for line in text.splitlines() if "AgileX" in line)
+    assert first == (
         "controller: AgileX base (declared in robot.toml, not reported by the controller); command_timeout_s 0.5 "
         "(which cannot be set otherwise); x_m 2 (declared in robot.toml, not reported by the controller)"
     )
-    assert len(lines) == 2
-    assert "AgileX base (oracle)" in lines[1]
+    assert "AgileX base (oracle)" in second
 
 
 def test_an_index_alone_does_not_prove_that_the_log_was_ended(tmp_path):

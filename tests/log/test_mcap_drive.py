@@ -17,12 +17,9 @@ def drive_of(path, ticks, **changes):
         return drive_from_log(log)
 
 
-def wheel(t_ns, angle=0.0):
-    return WheelSample(t_ns, t_ns, angle, angle, 0.0, 0.0)
-
-
-def command(t_ns, speed=1.0, in_force=True):
-    return Command(t_ns, 9.0, 9.0, speed, speed, 0.1, in_force)
+def numbered(records):
+    """Ticks of one record each."""
+    return [(k, [record]) for k, record in enumerate(records, start=1)]
 
 
 def test_what_was_executed_measured_and_seen(tmp_path):
@@ -41,7 +38,7 @@ def test_what_was_executed_measured_and_seen(tmp_path):
 
 
 def test_while_nothing_is_in_force_no_command_is_known(tmp_path):
-    drive = drive_of(tmp_path, [(k, [command(k, in_force=k != 2)]) for k in (1, 2, 3)])
+    drive = drive_of(tmp_path, numbered(Command(k, 9.0, 9.0, 1.0, 1.0, 0.1, k != 2) for k in (1, 2, 3)))
     assert np.isnan(drive.commands.left_rad_s).tolist() == [False, True, False]
     assert not drive.wheels.angle_measured
 
@@ -58,16 +55,13 @@ def test_missing_ticks_start_a_new_segment_in_every_array(tmp_path):
 
 def test_silent_wheels_start_a_new_segment(tmp_path):
     times = [0, 10**8, 2 * 10**8, 10**9, 11 * 10**8]
-    drive = drive_of(tmp_path, [(k, [wheel(t_ns)]) for k, t_ns in enumerate(times, start=1)])
+    drive = drive_of(tmp_path, numbered(WheelSample(t_ns, t_ns, 0.0, 0.0, 0.0, 0.0) for t_ns in times))
     assert drive.wheels.segment.tolist() == [0, 0, 0, 1, 1]
 
 
 def test_late_poses_are_put_in_order_and_doubles_and_broken_ones_left_out(tmp_path):
-    def pose(t_ns, x_m):
-        return PoseSample(t_ns, t_ns + 5, x_m, 0.0, 0.0, 0.1, 0.1)
-
     times = [(10**7, 1.0), (3 * 10**7, 3.0), (2 * 10**7, 2.0), (3 * 10**7, 99.0), (4 * 10**7, math.nan)]
-    drive = drive_of(tmp_path, [(k, [pose(t_ns, x_m)]) for k, (t_ns, x_m) in enumerate(times, start=1)])
+    drive = drive_of(tmp_path, numbered(PoseSample(t_ns, t_ns + 5, x_m, 0.0, 0.0, 0.1, 0.1) for t_ns, x_m in times))
     assert drive.poses.x_m.tolist() == [1.0, 2.0, 3.0]
     assert np.allclose(drive.poses.t_s, [0.0, 0.01, 0.02])
     assert any("not finite" in note for note in drive.notes)
@@ -77,7 +71,7 @@ def test_late_poses_are_put_in_order_and_doubles_and_broken_ones_left_out(tmp_pa
 def test_positions_without_heading_are_left_out_and_said_to_be(tmp_path):
     poses = [PoseSample(k * 10**7, k * 10**7, 1.0 * k, 0.0, math.nan, 0.02, math.nan) for k in range(1, 6)]
     good = PoseSample(6 * 10**7, 6 * 10**7, 6.0, 0.0, 0.5, 0.02, 0.02)
-    drive = drive_of(tmp_path, [(k, [pose]) for k, pose in enumerate([*poses, good], start=1)])
+    drive = drive_of(tmp_path, numbered([*poses, good]))
     assert drive.poses.x_m.tolist() == [6.0]
     (note,) = drive.notes
     assert "5 positions without heading were left out" in note
@@ -100,6 +94,7 @@ def test_a_log_in_which_nothing_was_driven_is_refused(tmp_path):
     ("content", "expected"),
     [
         (b"[robot]\nticks_per_rev = 2048\n", 2048),
+        (None, None),
         (b"[robot]\n", None),
         (b"robot = 3\n", None),
         (b"[robot]\nticks_per_rev = -1\n", None),
@@ -110,11 +105,6 @@ def test_a_log_in_which_nothing_was_driven_is_refused(tmp_path):
     ],
 )
 def test_the_ticks_of_a_revolution_come_from_the_configuration_in_the_log(tmp_path, content, expected):
-    kept = (Attachment("robot.toml", "application/toml", content),)
+    kept = () if content is None else (Attachment("robot.toml", "application/toml", content),)
     with open_log(write_log(tmp_path / "run.mcap", drive_ticks(1), attachments=kept)) as log:
         assert nominal_robot(log).get("ticks_per_rev") == expected
-
-
-def test_without_a_configuration_the_ticks_are_unknown(tmp_path):
-    with open_log(write_log(tmp_path / "run.mcap", drive_ticks(1), attachments=())) as log:
-        assert nominal_robot(log).get("ticks_per_rev") is None

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -6,10 +8,7 @@ from disco_hw.log.importing.csv_drive import length_fault, time_fault, yaw_fault
 
 RADIUS_M = 0.06
 TRACK_M = 0.31
-NONE = np.empty(0)
-NO_SEGMENT = np.empty(0, dtype=np.int64)
-NO_COMMANDS = Commands(NONE, NONE, NONE, NO_SEGMENT)
-NO_WHEELS = Wheels(NONE, NONE, NONE, NONE, NONE, NO_SEGMENT, False, False)
+NO_COMMANDS, NO_WHEELS = Commands(), Wheels()
 
 
 def circle(left=2.0, right=3.0, duration_s=60.0, rest_s=0.0, noise_m=0.0):
@@ -31,8 +30,8 @@ def circle(left=2.0, right=3.0, duration_s=60.0, rest_s=0.0, noise_m=0.0):
     return Poses(t_s, x_m + noise[0], y_m + noise[1], yaw, segment), wheels, Commands(t_s, *speeds, segment)
 
 
-def yaw_check(poses, wheels, commands, factor=1.0):
-    return yaw_fault(poses.t_s, factor * poses.yaw_rad, poses.segment, wheels, commands)
+def wrapped(yaw_rad):
+    return np.angle(np.exp(1j * yaw_rad))
 
 
 @pytest.mark.parametrize(
@@ -49,26 +48,21 @@ def test_too_few_times_say_nothing():
 @pytest.mark.parametrize("known", ["wheels", "commands", "neither"])
 def test_degrees_are_distinguished_from_radians_that_were_not_wrapped(known):
     poses, wheels, commands = circle(duration_s=120.0)
-    wheels = wheels if known == "wheels" else NO_WHEELS
-    commands = commands if known == "commands" else NO_COMMANDS
+    moved = (wheels if known == "wheels" else NO_WHEELS, commands if known == "commands" else NO_COMMANDS)
     assert np.abs(poses.yaw_rad).max() > 20.0
-    assert yaw_check(poses, wheels, commands) is None
-    degrees = yaw_check(poses, wheels, commands, factor=57.29578)
+    assert yaw_fault(poses.t_s, poses.yaw_rad, poses.segment, *moved) is None
+    degrees = yaw_fault(poses.t_s, 57.29578 * poses.yaw_rad, poses.segment, *moved)
     assert "degrees" in degrees
     assert "pose_yaw_rad" in degrees
 
 
-def test_wrapped_degrees_are_degrees():
+def test_wrapped_degrees_are_degrees_and_wrapped_radians_believed_whatever_the_wheels_say():
     poses, wheels, commands = circle(duration_s=120.0)
-    wrapped = np.degrees(np.angle(np.exp(1j * poses.yaw_rad)))
-    assert "degrees" in yaw_fault(poses.t_s, wrapped, poses.segment, wheels, commands)
-
-
-def test_wrapped_radians_are_believed_whatever_the_wheels_say():
+    degrees = np.degrees(wrapped(poses.yaw_rad))
+    assert "degrees" in yaw_fault(poses.t_s, degrees, poses.segment, wheels, commands)
     poses, _, _ = circle()
-    wrapped = np.angle(np.exp(1j * poses.yaw_rad))
     _, stationary, none = circle(0.0, 0.0)
-    assert yaw_fault(poses.t_s, wrapped, poses.segment, stationary, none) is None
+    assert yaw_fault(poses.t_s, wrapped(poses.yaw_rad), poses.segment, stationary, none) is None
 
 
 @pytest.mark.parametrize("speeds", [(2.0, 3.0), (3.0, 3.0), (-3.0, -3.0), (1.0, 4.0)])
@@ -79,38 +73,33 @@ def test_a_circle_and_a_line_in_metres_are_believed(speeds):
     assert length_fault(poses, NO_WHEELS, commands, RADIUS_M) is None
 
 
-def test_noise_at_rest_is_no_path():
-    poses, wheels, commands = circle(duration_s=20.0, rest_s=3000.0, noise_m=0.02)
-    assert length_fault(poses, wheels, commands, RADIUS_M) is None
+STATIONARY = circle(0.0, 0.0)
 
 
-def test_turning_on_the_spot_says_nothing():
-    poses, wheels, commands = circle(-3.0, 3.0)
+@pytest.mark.parametrize(
+    ("poses", "wheels", "commands"),
+    [
+        circle(duration_s=20.0, rest_s=3000.0, noise_m=0.02),
+        circle(-3.0, 3.0),
+        (STATIONARY[0], *circle()[1:]),
+        STATIONARY,
+        (STATIONARY[0], NO_WHEELS, NO_COMMANDS),
+    ],
+    ids=["noise at rest", "turning on the spot", "lifted wheels", "no motion", "no wheels"],
+)
+def test_a_drive_without_a_path_to_compare_says_nothing(poses, wheels, commands):
     assert length_fault(poses, wheels, commands, RADIUS_M) is None
 
 
 @pytest.mark.parametrize(("scale", "nominal"), [(1000.0, None), (100.0, RADIUS_M), (39.4, RADIUS_M), (5.0, RADIUS_M)])
 def test_millimetres_centimetres_and_inches_are_refused(scale, nominal):
     poses, wheels, commands = circle()
-    scaled = Poses(poses.t_s, scale * poses.x_m, scale * poses.y_m, poses.yaw_rad, poses.segment)
+    scaled = replace(poses, x_m=scale * poses.x_m, y_m=scale * poses.y_m)
     assert "write metres" in length_fault(scaled, wheels, commands, nominal)
 
 
 @pytest.mark.parametrize(("scale", "nominal"), [(57.3, None), (9.55, RADIUS_M)])
 def test_wheels_in_degrees_or_rpm_are_refused(scale, nominal):
     poses, wheels, commands = circle()
-    angles = (scale * wheels.left_angle_rad, scale * wheels.right_angle_rad)
-    fast = Wheels(wheels.t_s, *angles, wheels.left_speed_rad_s, wheels.right_speed_rad_s, wheels.segment, True, True)
-    assert "rad/s" in length_fault(poses, fast, commands, nominal)
-
-
-def test_lifted_wheels_are_believed():
-    _, wheels, commands = circle()
-    poses, _, _ = circle(0.0, 0.0)
-    assert length_fault(poses, wheels, commands, RADIUS_M) is None
-
-
-def test_without_motion_or_without_wheels_nothing_is_said():
-    poses, wheels, commands = circle(0.0, 0.0)
-    assert length_fault(poses, wheels, commands, RADIUS_M) is None
-    assert length_fault(poses, NO_WHEELS, NO_COMMANDS, RADIUS_M) is None
+    angles = {name: scale * getattr(wheels, name) for name in ("left_angle_rad", "right_angle_rad")}
+    assert "rad/s" in length_fault(poses, replace(wheels, **angles), commands, nominal)

@@ -24,6 +24,11 @@ def path(tmp_path):
     return tmp_path / "logs" / "run.mcap"
 
 
+@pytest.fixture
+def recorder(path):
+    return ProcessRecorder(recording(path))
+
+
 def test_what_is_put_is_in_the_log(path):
     recorder = ProcessRecorder(recording(path, version="9.9.9"))
     times = drive(recorder, 1, 200)
@@ -55,6 +60,12 @@ def kept_going(recorder, first, until, period_s=0.01, timeout_s=60.0):
         time.sleep(period_s)
 
 
+def kept_going_until_replaced(recorder, first, deaths=1):
+    """Go on until so many writers have died, and another records; returns the next number."""
+    first = kept_going(recorder, first, lambda stats: stats.writer_deaths == deaths)
+    return kept_going(recorder, first, lambda stats: not stats.fault)
+
+
 def all_accounted(stats, given):
     """Every tick that was given is in exactly one place."""
     assert stats.ticks + stats.dropped_ticks == given
@@ -62,8 +73,7 @@ def all_accounted(stats, given):
     return True
 
 
-def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lost(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lost(path, recorder):
     following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 5)
     stopped = recorder.writer_pid
     polls_s = [time.monotonic()]
@@ -73,8 +83,7 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     silent_s = float(re.search(r"the log writer has not answered for (\d+\.\d) s", reported)[1])
     # Within a second, but for what this machine withheld from the one who looks.
     assert silent_s < 0.9 + max(later - earlier for earlier, later in pairwise(polls_s))
-    following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
-    following = kept_going(recorder, following, lambda stats: not stats.fault)
+    following = kept_going_until_replaced(recorder, following)
     wait_until(lambda: not alive(stopped))
     messages = recorder.new_messages()
     assert "was stopped" in messages[0]
@@ -95,14 +104,20 @@ def test_a_stopped_writer_is_reported_within_a_second_replaced_and_nothing_is_lo
     assert f"continues {path}" in info(recorder.path, as_json=False)
 
 
-def test_what_a_queue_cannot_hold_is_counted_and_seen_in_the_log(path):
+def with_stopped_writer(path, count):
+    """A recorder with a queue of 20 ticks whose writer stood still for `count` after the tenth; its counts then."""
     recorder = ProcessRecorder(recording(path, queue_ticks=20))
     drive(recorder, 1, 10)
     wait_until(lambda: recorder.poll().delivered_ticks == 10)
     os.kill(recorder.writer_pid, signal.SIGSTOP)
-    drive(recorder, 11, 1000)
+    drive(recorder, 11, count)
     stats = recorder.poll()
     os.kill(recorder.writer_pid, signal.SIGCONT)
+    return recorder, stats
+
+
+def test_what_a_queue_cannot_hold_is_counted_and_seen_in_the_log(path):
+    recorder, stats = with_stopped_writer(path, 1000)
     assert (stats.dropped_ticks, stats.waiting_ticks) == (980, 20)
     assert all_accounted(stats, 1010)
     wait_until(lambda: recorder.poll().waiting_ticks == 0)
@@ -115,12 +130,7 @@ def test_what_a_queue_cannot_hold_is_counted_and_seen_in_the_log(path):
 
 
 def test_a_queue_that_was_never_delivered_is_missing_at_the_end(path):
-    recorder = ProcessRecorder(recording(path, queue_ticks=20))
-    drive(recorder, 1, 10)
-    wait_until(lambda: recorder.poll().delivered_ticks == 10)
-    os.kill(recorder.writer_pid, signal.SIGSTOP)
-    drive(recorder, 11, 50)
-    os.kill(recorder.writer_pid, signal.SIGCONT)
+    recorder, _ = with_stopped_writer(path, 50)
     assert recorder.close().dropped_ticks == 30
     assert recorded_ticks(path) == list(range(1, 31))
     with open_log(path) as log:
@@ -128,44 +138,37 @@ def test_a_queue_that_was_never_delivered_is_missing_at_the_end(path):
         assert log.summary().missing_ticks == 30
 
 
-def test_a_writer_that_is_only_slow_goes_on_with_its_file(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_writer_that_is_only_slow_goes_on_with_its_file(path, recorder):
     following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 5)
     os.kill(recorder.writer_pid, signal.SIGSTOP)
     following = kept_going(recorder, following, lambda stats: stats.fault)
     os.kill(recorder.writer_pid, signal.SIGCONT)
     following = kept_going(recorder, following, lambda stats: not stats.fault)
-    final = recorder.close()
-    assert final.writer_deaths == 0
+    assert recorder.close().writer_deaths == 0
     assert recorder.new_messages()[-1] == f"recording goes on in {path}"
     assert recorded_ticks(path) == list(range(1, following))
 
 
 @pytest.mark.parametrize("what", ["file", "directory"])
-def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(path, what):
-    recorder = ProcessRecorder(recording(path))
+def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(path, recorder, what):
     following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 20)
     if what == "file":
         path.unlink()
     else:
         shutil.rmtree(path.parent)
-    following = kept_going(recorder, following, lambda stats: stats.writer_deaths == 1)
-    following = kept_going(recorder, following, lambda stats: not stats.fault)
+    following = kept_going_until_replaced(recorder, following)
     assert "was deleted while it was being written" in recorder.new_messages()[0]
     final = recorder.close()
     assert recorder.path == path.with_name("run.part2.mcap")
     assert not path.exists()
     assert all_accounted(final, following - 1)
-    kept = recorded_ticks(recorder.path)
-    assert kept == list(range(final.lost_ticks + 1, following))
+    assert recorded_ticks(recorder.path) == list(range(final.lost_ticks + 1, following))
     assert final.lost_ticks > 20
     with open_log(recorder.path) as log:
-        assert log.metadata.continues == str(path)
-        assert log.metadata.continues_sequence == final.lost_ticks
+        assert (log.metadata.continues, log.metadata.continues_sequence) == (str(path), final.lost_ticks)
 
 
-def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on(path, recorder):
     drive(recorder, 1, 5)
     # What a writer has written and not confirmed is in the next file, too.
     wait_until(lambda: recorder.poll().waiting_ticks == 0)
@@ -184,22 +187,19 @@ def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on
     assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))
 
 
-def test_one_writer_after_the_other_may_die(path):
-    recorder = ProcessRecorder(recording(path))
+def test_one_writer_after_the_other_may_die(path, recorder):
     following = 1
     for deaths in (1, 2, 3):
         following = kept_going(recorder, following, lambda stats: stats.waiting_ticks < 3)
         wait_until(lambda: recorder.poll().waiting_ticks == 0)
         os.kill(recorder.writer_pid, signal.SIGKILL)
-        following = kept_going(recorder, following, lambda stats, deaths=deaths: stats.writer_deaths == deaths)
-        following = kept_going(recorder, following, lambda stats: not stats.fault)
+        following = kept_going_until_replaced(recorder, following, deaths)
     recorder.close()
     parts = [path, *(path.with_name(f"run.part{part}.mcap") for part in (2, 3, 4))]
     assert [k for part in parts for k in recorded_ticks(part)] == list(range(1, following))
 
 
-def test_a_tick_without_records_is_not_one_that_is_missing(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_tick_without_records_is_not_one_that_is_missing(path, recorder):
     for t_ns in (1, 2, 3):
         recorder.put(t_ns, [])
         recorder.put(t_ns, tick(t_ns))
@@ -208,8 +208,7 @@ def test_a_tick_without_records_is_not_one_that_is_missing(path):
         assert (log.summary().ticks, log.summary().missing_ticks) == (3, 0)
 
 
-def test_a_record_that_cannot_be_encoded_costs_itself_only(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_record_that_cannot_be_encoded_costs_itself_only(path, recorder):
     bad = [Event(2**70, "info", "a", "b"), Event(1, "info", "a", object()), object()]
     recorder.put(5, [Event(1, "info", "a", "first"), *bad, Event(1, "info", "a", "last")])
     recorder.put(6, bad)
@@ -220,25 +219,21 @@ def test_a_record_that_cannot_be_encoded_costs_itself_only(path):
         assert [entry.record.text for entry in log.records()] == ["first", "last"]
 
 
-def test_a_record_that_the_writer_refuses_is_counted_and_named(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_record_that_the_writer_refuses_is_counted_and_named(recorder):
     recorder.put(5, [Event(1, "loud" * 5000, "a", "b"), Event(1, "info", "a", "kept")])
     stats = recorder.close()
-    assert (stats.refused, stats.written) == (1, 1)
+    assert (stats.refused, stats.written, stats.writer_deaths) == (1, 1, 0)
     assert len(stats.last_error) < 1000
     assert "loud" in stats.last_error
-    assert stats.writer_deaths == 0
 
 
-def test_a_writer_killed_is_noticed_and_replaced_by_another_part(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_writer_killed_is_noticed_and_replaced_by_another_part(path, recorder):
     drive(recorder, 1, 50)
     recorder.put(51, [Event(1, "loud", "a", "b")])
     wait_until(lambda: recorder.poll().refused > 0)
     os.kill(recorder.writer_pid, signal.SIGKILL)
     following = kept_going(recorder, 52, lambda stats: stats.writer_deaths == 1)
-    stats = recorder.poll()
-    assert "signal 9" in stats.last_error
+    assert "signal 9" in recorder.poll().last_error
     following = kept_going(recorder, following, lambda stats: not stats.fault)
     final = recorder.close()
     assert (final.writer_deaths, final.refused) == (1, 1)
@@ -248,8 +243,7 @@ def test_a_writer_killed_is_noticed_and_replaced_by_another_part(path):
         assert (log.metadata.part, log.summary().missing_ticks) == (2, 0)
 
 
-def test_a_writer_that_was_asked_to_end_by_somebody_else_is_replaced(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_writer_that_was_asked_to_end_by_somebody_else_is_replaced(path, recorder):
     drive(recorder, 1, 5)
     os.kill(recorder.writer_pid, signal.SIGTERM)
     following = kept_going(recorder, 6, lambda stats: stats.writer_deaths == 1)
@@ -261,8 +255,7 @@ def test_a_writer_that_was_asked_to_end_by_somebody_else_is_replaced(path):
         assert (log.complete, log.summary().ended) == (True, False)
 
 
-def test_a_writer_that_says_it_has_failed_ends_no_fault(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_writer_that_says_it_has_failed_ends_no_fault(path, recorder):
     drive(recorder, 1, 5)
     shutil.rmtree(path.parent)
     path.parent.write_text("in the way")
@@ -274,8 +267,7 @@ def test_a_writer_that_says_it_has_failed_ends_no_fault(path):
     recorder.close()
 
 
-def test_close_waits_no_longer_than_asked_and_the_writer_finishes_by_itself(path):
-    recorder = ProcessRecorder(recording(path))
+def test_close_waits_no_longer_than_asked_and_the_writer_finishes_by_itself(path, recorder):
     drive(recorder, 1, 20)
     wait_until(lambda: recorder.poll().written > 0)
     writer = recorder.writer_pid
@@ -292,8 +284,7 @@ def test_close_waits_no_longer_than_asked_and_the_writer_finishes_by_itself(path
         assert log.complete
 
 
-def test_close_twice_and_put_after_close_do_no_harm(path):
-    recorder = ProcessRecorder(recording(path))
+def test_close_twice_and_put_after_close_do_no_harm(path, recorder):
     drive(recorder, 1, 3)
     stats = recorder.close()
     recorder.put(1, tick(4))
@@ -301,8 +292,7 @@ def test_close_twice_and_put_after_close_do_no_harm(path):
     assert recorded_ticks(path) == [1, 2, 3]
 
 
-def test_no_process_no_thread_and_no_file_is_left_behind(path, runtime_root):
-    recorder = ProcessRecorder(recording(path))
+def test_no_process_no_thread_and_no_file_is_left_behind(recorder, runtime_root):
     threads = len(os.listdir("/proc/self/task"))
     processes = (recorder.writer_pid, recorder.keeper_pid)
     recorder.close()

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from disco_hw.errors import LogError
+from disco_hw.errors import InputError, LogError
 from disco_hw.log import writer
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder
@@ -37,9 +37,13 @@ def path(tmp_path):
     return tmp_path / "run.mcap"
 
 
-@pytest.mark.usefixtures("forked_keepers")
-def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path):
-    recorder = ProcessRecorder(recording(path, flush_s=0.05))
+@pytest.fixture
+def recorder(path, request):
+    request.getfixturevalue("forked_keepers")
+    return ProcessRecorder(recording(path))
+
+
+def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path, recorder):
     drive(recorder, 1, 200, period_s=0.002)
     wait_until(lambda: recorder.poll().delivered_ticks > 100)
     written = recorder.poll().delivered_ticks * 7
@@ -92,10 +96,8 @@ def test_when_both_are_killed_the_file_still_reads(path):
     assert len(recorded_ticks(path)) > 20
 
 
-@pytest.mark.usefixtures("forked_keepers")
 @pytest.mark.parametrize(("sent", "ticks"), [(signal.SIGINT, 5), (signal.SIGTERM, 50)])
-def test_what_comes_after_an_interrupt_or_a_termination_is_still_recorded(path, sent, ticks):
-    recorder = ProcessRecorder(recording(path))
+def test_what_comes_after_an_interrupt_or_a_termination_is_still_recorded(path, recorder, sent, ticks):
     drive(recorder, 1, 5)
     wait_until(lambda: recorder.poll().written > 0)
     os.kill(recorder.writer_pid, sent)
@@ -140,82 +142,69 @@ def check_after_full_disk(path, stats, message):
     assert len(recorded_ticks(path)) > 20
 
 
-@pytest.mark.usefixtures("forked_keepers")
-def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(tmp_path):
+@pytest.fixture
+def full_disk(tmp_path, request):
+    """A full disk, a recorder whose writer has met it, its counters by then, and how many ticks were given."""
+    request.getfixturevalue("forked_keepers")
     with SmallDisk(tmp_path, 4160) as disk:
-        filler = disk / "filler"
         # With 120 kB beside it; without it there is room for all that a slow machine has waiting by then.
-        filler.write_bytes(bytes(4040 * 1024))
-        path = disk / "run.mcap"
-        recorder = ProcessRecorder(recording(path))
-        stats, given = fill(recorder)
-        check_after_full_disk(path, stats, "No space left on device")
-        wait_until(lambda: recorder.poll().writer_deaths > 2)
-        # It tries again and again, and leaves nothing lying about when that fails.
-        assert sum(entry.suffix == ".mcap" for entry in disk.iterdir()) <= 2
-        assert len([line for line in recorder.new_messages() if "No space" in line]) <= 3
-        filler.unlink()
-        wait_until(lambda: not recorder.poll().fault and recorder.poll().waiting_ticks == 0)
-        final = recorder.close()
-        assert final.ticks + final.dropped_ticks == given
-        assert final.delivered_ticks == final.ticks
-        assert recorder.path == disk / "run.part2.mcap"
-        assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, final.ticks + 1))
+        (disk / "filler").write_bytes(bytes(4040 * 1024))
+        recorder = ProcessRecorder(recording(disk / "run.mcap"))
+        yield disk, recorder, *fill(recorder)
 
 
-def full_recorder(disk):
-    """A recorder whose writer has met a full disk, the file to delete for room, and how many ticks were given."""
-    filler = disk / "filler"
-    filler.write_bytes(bytes(4040 * 1024))
-    recorder = ProcessRecorder(recording(disk / "run.mcap"))
-    _, given = fill(recorder)
-    return recorder, filler, given
+def test_a_full_disk_ends_the_log_and_with_room_again_another_begins(full_disk):
+    disk, recorder, stats, given = full_disk
+    check_after_full_disk(disk / "run.mcap", stats, "No space left on device")
+    wait_until(lambda: recorder.poll().writer_deaths > 2)
+    # It tries again and again, and leaves nothing lying about when that fails.
+    assert sum(entry.suffix == ".mcap" for entry in disk.iterdir()) <= 2
+    assert len([line for line in recorder.new_messages() if "No space" in line]) <= 3
+    (disk / "filler").unlink()
+    wait_until(lambda: not recorder.poll().fault and recorder.poll().waiting_ticks == 0)
+    final = recorder.close()
+    assert final.ticks + final.dropped_ticks == given
+    assert final.delivered_ticks == final.ticks
+    assert recorder.path == disk / "run.part2.mcap"
+    assert recorded_ticks(disk / "run.mcap") + recorded_ticks(recorder.path) == list(range(1, final.ticks + 1))
 
 
-@pytest.mark.usefixtures("forked_keepers")
-def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_files_that_exist(tmp_path):
-    with SmallDisk(tmp_path, 4160) as disk:
-        recorder, _, given = full_recorder(disk)
-        recorder.new_messages()
-        final = recorder.close(1.0)
-        assert final.waiting_ticks == given - final.delivered_ticks > 0
-        messages = recorder.new_messages()
-        assert f"{final.waiting_ticks} of {given} ticks are not in the log: " in messages[-1]
-        assert "No space left on device" in messages[-1]
-        assert not [line for line in messages if "goes on" in line]
-        assert final.fault == messages[-1]
-        assert Path(final.path).exists()
+def test_the_last_words_with_a_full_disk_count_the_ticks_that_are_lost_and_name_files_that_exist(full_disk):
+    _, recorder, _, given = full_disk
+    recorder.new_messages()
+    final = recorder.close(1.0)
+    assert final.waiting_ticks == given - final.delivered_ticks > 0
+    messages = recorder.new_messages()
+    assert f"{final.waiting_ticks} of {given} ticks are not in the log: " in messages[-1]
+    assert "No space left on device" in messages[-1]
+    assert not [line for line in messages if "goes on" in line]
+    assert final.fault == messages[-1]
+    assert Path(final.path).exists()
 
 
-@pytest.mark.usefixtures("forked_keepers")
-def test_the_last_words_during_an_attempt_name_a_file_that_stays(tmp_path):
-    with SmallDisk(tmp_path, 4160) as disk:
-        recorder, _, _ = full_recorder(disk)
-        wait_until(lambda: recorder.poll() and recorder.path.name == "run.part2.mcap")
-        final = recorder.close(0.0)
-        wait_until(lambda: not (disk / "run.part2.mcap").exists())
-        assert Path(final.path).exists()
+def test_the_last_words_during_an_attempt_name_a_file_that_stays(full_disk):
+    disk, recorder, _, _ = full_disk
+    wait_until(lambda: recorder.poll() and recorder.path.name == "run.part2.mcap")
+    final = recorder.close(0.0)
+    wait_until(lambda: not (disk / "run.part2.mcap").exists())
+    assert Path(final.path).exists()
 
 
-@pytest.mark.usefixtures("forked_keepers")
-def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_before_it_ends(tmp_path):
-    with SmallDisk(tmp_path, 4160) as disk:
-        recorder, filler, given = full_recorder(disk)
-        # The next attempt is seconds away.
-        wait_until(lambda: recorder.poll().writer_deaths > 3)
-        recorder.new_messages()
-        filler.unlink()
-        final = recorder.close()
-        assert (final.delivered_ticks, final.waiting_ticks, final.fault) == (given, 0, "")
-        assert recorder.new_messages() == (f"recording goes on in {final.path}",)
-        assert recorded_ticks(disk / "run.mcap") + recorded_ticks(Path(final.path)) == list(range(1, given + 1))
-        with open_log(Path(final.path)) as log:
-            assert log.summary().start < log.summary().end
+def test_a_disk_with_room_again_at_the_end_loses_nothing_and_the_part_begins_before_it_ends(full_disk):
+    disk, recorder, _, given = full_disk
+    # The next attempt is seconds away.
+    wait_until(lambda: recorder.poll().writer_deaths > 3)
+    recorder.new_messages()
+    (disk / "filler").unlink()
+    final = recorder.close()
+    assert (final.delivered_ticks, final.waiting_ticks, final.fault) == (given, 0, "")
+    assert recorder.new_messages() == (f"recording goes on in {final.path}",)
+    assert recorded_ticks(disk / "run.mcap") + recorded_ticks(Path(final.path)) == list(range(1, given + 1))
+    with open_log(Path(final.path)) as log:
+        assert log.summary().start < log.summary().end
 
 
-@pytest.mark.usefixtures("forked_keepers")
-def test_a_file_that_may_not_grow_is_continued_by_another(path):
-    recorder = ProcessRecorder(recording(path))
+def test_a_file_that_may_not_grow_is_continued_by_another(path, recorder):
     resource.prlimit(recorder.writer_pid, resource.RLIMIT_FSIZE, (100_000, 100_000))
     stats, given = fill(recorder)
     check_after_full_disk(path, stats, "File too large")
@@ -294,8 +283,6 @@ def test_a_half_written_end_is_cut_off(path):
 
 
 def test_the_errors_of_a_log_are_those_of_bad_input():
-    from disco_hw.errors import InputError
-
     assert issubclass(LogError, InputError)
 
 

@@ -17,7 +17,7 @@ from disco_hw.runtime.core import CoreTick
 from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.replay import ReplayReport, replay
 from disco_hw.runtime.robot_setup import kept_files, load_setup
-from disco_hw.runtime.supervisor import UserRequest
+from disco_hw.runtime.supervisor import Reply, UserRequest
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
 
@@ -54,6 +54,23 @@ def start(stack: SimulatedRun, seconds: float) -> list[CoreTick]:
     """Arm the robot, start the task, and return the ticks of so long a drive."""
     arm(stack)
     return stack.run(seconds, UserRequest.START)
+
+
+def recorded(stack: SimulatedRun, kind: type[Record]) -> list[Record]:
+    """Return the records of a type that a run has recorded."""
+    return [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, kind)]
+
+
+def replies(ticks: Iterable[CoreTick]) -> list[Reply]:
+    """Return the replies that were given in these ticks."""
+    return [reply for tick in ticks for reply in tick.output.replies]
+
+
+def robot_toml(directory: Path, lines: str) -> Path:
+    """Write robot.toml: the shipped one, to which these lines are added; returns its path."""
+    path = directory / "robot.toml"
+    path.write_text(f"{ROBOT_TEXT}\n{lines}", encoding="utf-8")
+    return path
 
 
 def write_ticks(

@@ -63,6 +63,11 @@ class Bench:
             robot = DriverState.ARMING if request is Request.ARM else DriverState(request.value)
         self.inputs = replace(self.inputs, driver_state=robot)
 
+    def connected(self):
+        self.tick(driver_state=DriverState.HANDSHAKE)
+        assert self.out.state is State.HANDSHAKE
+        return self
+
     def ready(self):
         self.tick(count=4)
         assert self.out.state is State.READY

@@ -26,7 +26,7 @@ from sim.effects import hidden_effects
 from sim.plant import Plant
 from sim.plant_parameters import PlantParameters
 from sim.virtual_robot import VirtualRobot
-from tests.runtime.simulated import START, arm, simulated_stack, start
+from tests.runtime.simulated import START, arm, recorded, replies, simulated_stack, start
 from tests.tables import thinned
 
 TASK = CircleTask(radius_m=0.45, speed_m_s=0.25)
@@ -48,15 +48,11 @@ def lap():
     return stack, Path(*np.array(rows).T), stopping
 
 
-def test_the_circle_is_followed_in_simulated_time(lap):
-    _, path, _ = lap
+def test_the_circle_is_followed_and_the_stop_ends_in_ready_with_still_wheels(lap):
+    stack, path, stopping = lap
     figures = circle_figures(path, TASK)
     assert figures.laps > 0.9
     assert figures.settled_rms_distance_m < 0.05
-
-
-def test_the_stop_ends_in_ready_with_still_wheels(lap):
-    stack, _, stopping = lap
     assert stopping[-1].output.state is State.READY
     assert stack.robot.truth.left_speed_rad_s == pytest.approx(0.0, abs=0.05)
     assert stack.robot.board.outputs.state in {"STANDBY", "READY"}
@@ -69,7 +65,7 @@ def test_everything_is_recorded(lap):
         records.FrameIn, records.FrameOut, records.Estimate, records.Innovation, records.Plan, records.Command,
         records.Event,
     } <= kinds  # fmt: skip
-    commands = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Command)]
+    commands = recorded(stack, records.Command)
     assert len(commands) == len(stack.recorder.ticks)
     driven = [command for command in commands if command.in_force and command.source == "plan"]
     assert len(driven) > 500
@@ -80,9 +76,9 @@ def test_no_command_frame_leaves_before_arming():
     stack = simulated_stack()
     stack.run(1.0)
     assert stack.core.last.output.state is State.READY
-    sent = [r for _, tick in stack.recorder.ticks for r in tick if isinstance(r, records.FrameOut)]
+    sent = {frame.can_id for frame in recorded(stack, records.FrameOut)}
     assert sent
-    assert not [frame for frame in sent if frame.can_id == 0x100]
+    assert 0x100 not in sent
 
 
 def test_a_lost_link_voids_the_session_and_nothing_rearms():
@@ -127,7 +123,7 @@ def test_a_controller_exchanged_on_a_living_link_is_judged_anew(limits):
     last = stack.run(1.5)[-1].output
     assert last.state is State.FAULT, last.detail
     assert next(iter(limits)) in last.detail
-    assert not any(reply.accepted for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.output.replies)
+    assert not any(reply.accepted for reply in replies(stack.run(0.1, UserRequest.ARM)))
     # The one that fits is taken again, once a person has reset.
     exchanged(stack)
     stack.run(1.5)
@@ -139,10 +135,7 @@ def test_the_log_says_which_controller_answers_and_who_says_its_limits():
     stack = simulated_stack(NoPlanner(), needs_pose=False)
     stack.run(1.5)
 
-    def recorded():
-        return [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Controller)]
-
-    (first,) = recorded()
+    (first,) = recorded(stack, records.Controller)
     assert (first.controller, first.said_by) == ("reference controller", "device")
     assert (first.told["max_wheel_speed_rad_s"], first.told["ticks_per_rev"]) == (8.0, 2048.0)
     assert first.fixed == first.declared == {}
@@ -151,7 +144,7 @@ def test_the_log_says_which_controller_answers_and_who_says_its_limits():
     assert "controller: reference controller, firmware" in describe({**shown, "do": "status"}, SHIPPED_ROBOT)
     exchanged(stack, max_wheel_speed_rad_s=4.0)
     stack.run(1.5)
-    assert recorded()[-1].told["max_wheel_speed_rad_s"] == 4.0
+    assert recorded(stack, records.Controller)[-1].told["max_wheel_speed_rad_s"] == 4.0
 
 
 def test_limits_are_recorded_under_who_says_them():
@@ -182,14 +175,13 @@ def test_a_wheel_that_turns_either_way_on_either_side_keeps_the_robot_from_being
     receive = stack.core.driver.receive
 
     def turning(now_ns, frames):
-        readings = receive(now_ns, frames)
-        left, right = speeds
+        readings, (left, right) = receive(now_ns, frames), speeds
         wheels = tuple(replace(sample, left_speed_rad_s=left, right_speed_rad_s=right) for sample in readings.wheels)
         return replace(readings, wheels=wheels)
 
     stack.core.driver.receive = turning
     stack.run(0.1)
-    (reply,) = (reply for tick in stack.run(0.02, UserRequest.ARM) for reply in tick.output.replies)
+    (reply,) = replies(stack.run(0.02, UserRequest.ARM))
     assert (reply.accepted, "the wheels are turning" in reply.text) == (False, True)
 
 
@@ -210,6 +202,10 @@ class Altered:
         self.inner.set_belief(belief)
 
 
+def events_of_planner(ticks):
+    return [text for tick in ticks for text in tick.events if text.startswith("planner")]
+
+
 def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_down():
     def give_up(now_ns, plan):
         if now_ns > 1_400_000_000:
@@ -225,8 +221,7 @@ def test_a_planner_that_gives_up_is_followed_on_its_tail_then_the_wheels_ramp_do
     assert set(sources[tail[-1] + 1 :]) == {Source.RAMP}
     assert ticks[-1].pipeline.command.left_rad_s == 0.0
     assert ticks[-1].output.state is State.ARMED
-    reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
-    assert reported == ["planner: planted"]
+    assert events_of_planner(ticks) == ["planner: planted"]
 
 
 def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
@@ -242,9 +237,9 @@ def test_the_wheels_of_a_tick_are_announced_before_it_is_planned_and_recorded():
     planned = [k for k, (what, *_) in enumerate(happened) if what == "plan"]
     assert planned
     assert all(happened[k - 1][:2] == ("wheels", happened[k][1]) for k in planned)
-    recorded = [(now_ns, *(one for one in rows if type(one) is WheelSample)) for now_ns, rows in stack.recorder.ticks]
-    assert [reported[1:] for reported in happened if reported[0] == "wheels"] == [
-        tick for tick in recorded if len(tick) > 1
+    samples = [(now_ns, *(one for one in rows if type(one) is WheelSample)) for now_ns, rows in stack.recorder.ticks]
+    assert [announced for what, *announced in happened if what == "wheels"] == [
+        list(tick) for tick in samples if len(tick) > 1
     ]
 
 
@@ -254,9 +249,7 @@ def test_plans_that_hang_on_too_few_samples_are_reported_once():
             return plan
         return replace(plan, diagnostics=replace(plan.diagnostics, ess=1.2, collapsed=True))
 
-    ticks = start(simulated_stack(Altered(collapse)), 1.2)
-    reported = [text for tick in ticks for text in tick.events if text.startswith("planner")]
-    assert reported == [
+    assert events_of_planner(start(simulated_stack(Altered(collapse)), 1.2)) == [
         "planner: plans rest on 1.2 effective samples, too few to trust the plan",
         "planner: enough effective samples again",
     ]
@@ -264,9 +257,8 @@ def test_plans_that_hang_on_too_few_samples_are_reported_once():
 
 def test_runs_with_one_seed_are_equal_bit_for_bit():
     def commands():
-        stack = simulated_stack(seed=3)
-        ticks = start(stack, 1.0)
-        return [(tick.pipeline.command.left_rad_s, tick.pipeline.command.right_rad_s) for tick in ticks]
+        commands = [tick.pipeline.command for tick in start(simulated_stack(seed=3), 1.0)]
+        return [(command.left_rad_s, command.right_rad_s) for command in commands]
 
     first = commands()
     assert any(left != 0.0 for left, _ in first)

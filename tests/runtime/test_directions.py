@@ -4,6 +4,7 @@ import math
 import random
 import tracemalloc
 
+import numpy as np
 import pytest
 
 from disco_hw.runtime import State
@@ -75,7 +76,7 @@ def first_finding(vendor, reported, true, speeds, seconds=3.0):
         bench.command = command
         for _ in range(20):
             bench.step()
-            now, before = list(bench.robot.angle), (bench.robot.angle, before)[1]
+            now = list(bench.robot.angle)
             floor.roll(now[0] - before[0], now[1] - before[1])
             before = now
         if moving_ns is None and bench.robot.speed_rad_s > 0.1:
@@ -101,36 +102,36 @@ def test_a_right_wiring_is_let_alone(vendor, speeds):
     assert first_finding(vendor, AS_CONFIGURED, AS_CONFIGURED, speeds) is None
 
 
-def drive(watch, commands, turned, poses=()):
-    """Ticks with speeds asked and angles counted; what was found, and in which tick."""
+def watching(reported=AS_CONFIGURED):
+    return Directions(RADIUS_M, TRACK_M, reported)
+
+
+def drive(watch, commands, turned, *followed):
+    """Ticks with speeds asked and angles counted; what was found, None for nothing."""
     last = (0.0, 0.0)
     for tick, (speeds, angles) in enumerate(zip(commands, turned, strict=True)):
         now_ns = tick * TICK_NS
         rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]
         sample, last = WheelSample(now_ns, now_ns, *angles, *rates), angles
-        found = watch.step(now_ns, (sample,), poses, WheelCommand(*speeds, 0.1))
+        found = watch.step(now_ns, (sample,), (), WheelCommand(*speeds, 0.1), *followed)
         if found is not None:
-            return tick, found
+            return found
     return None
 
 
 def test_wheels_that_lag_while_the_command_swings_are_let_alone():
     commands = [(4.0 * math.cos(tick / 9), 3.0 * math.cos(tick / 7)) for tick in range(200)]
-    turned, angle = [], (0.0, 0.0)
-    for tick in range(200):
-        speeds = commands[tick - 12] if tick >= 12 else (0.0, 0.0)
-        angle = (angle[0] + 0.02 * speeds[0], angle[1] + 0.02 * speeds[1])
-        turned.append(angle)
-    assert drive(Directions(RADIUS_M, TRACK_M, AS_CONFIGURED), commands, turned) is None
+    turned = 0.02 * np.cumsum([[0.0, 0.0]] * 12 + commands[:-12], axis=0)
+    assert drive(watching(), commands, turned.tolist()) is None
 
 
 def test_what_was_already_written_is_what_changes():
     found = drive(
-        Directions(RADIUS_M, TRACK_M, Wiring(encoder_direction=(1, -1))),
+        watching(Wiring(encoder_direction=(1, -1))),
         [(0.0, 0.0)] + [(2.0, 2.0)] * 30,
         [(0.04 * max(tick - 2, 0), -0.04 * max(tick - 2, 0)) for tick in range(31)],
     )
-    assert "wheels.encoder_direction = [1, 1] if it turned as commanded" in found[1]
+    assert "wheels.encoder_direction = [1, 1] if it turned as commanded" in found
 
 
 @thinned("wiring", [RIGHT_REVERSED, Wiring(sides_swapped=True), Wiring(encoder_direction=(1, -1))], quick=1)
@@ -162,7 +163,7 @@ def test_a_robot_that_is_wired_as_declared_is_let_alone():
 
 @pytest.mark.thorough
 def test_ten_minutes_of_driving_keep_no_more_than_the_first_seconds():
-    directions = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED)
+    directions = watching()
     command, floor = WheelCommand(2.0, 2.0, 0.1), Floor()
 
     def drive(ticks):
@@ -193,7 +194,7 @@ def test_a_robot_whose_geometry_is_written_down_wrongly_is_not_taken_for_miswire
 
 @pytest.mark.parametrize("runs_at", [3.0, 9.0])
 def test_a_wheel_that_does_not_count_gets_no_wiring_advice_however_it_turns(runs_at):
-    watch, floor, found = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED), Floor(), []
+    watch, floor, found = watching(), Floor(), []
     for tick in range(150):
         now_ns, moves = tick * TICK_NS, tick > 12
         floor.roll(0.02 * runs_at * moves, 0.06 * moves)
@@ -207,14 +208,5 @@ def test_a_wheel_that_does_not_count_gets_no_wiring_advice_however_it_turns(runs
 def test_a_wheel_that_counts_backward_after_it_has_followed_gets_no_wiring_advice():
     commands = [(0.0, 0.0)] + [(2.0, 2.0)] * 60
     turned = [(0.0, 0.0)] + [(0.04 * (tick if tick < 10 else 20 - tick), 0.04 * tick) for tick in range(60)]
-    last, found = (0.0, 0.0), {}
-    for followed in (False, True):
-        watch = Directions(RADIUS_M, TRACK_M, AS_CONFIGURED)
-        for tick, (speeds, angles) in enumerate(zip(commands, turned, strict=True)):
-            now_ns = tick * TICK_NS
-            rates = [(now - was) / 0.02 for now, was in zip(angles, last, strict=True)]
-            sample, last = WheelSample(now_ns, now_ns, *angles, *rates), angles
-            finding = watch.step(now_ns, (sample,), (), WheelCommand(*speeds, 0.1), (followed, followed))
-            found[followed] = found.get(followed) or finding
-    assert "wheels.encoder_direction" in found[False]
-    assert found[True] is None
+    assert "wheels.encoder_direction" in drive(watching(), commands, turned, (False, False))
+    assert drive(watching(), commands, turned, (True, True)) is None

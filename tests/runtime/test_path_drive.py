@@ -9,6 +9,7 @@ from msgspec.structs import replace
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.log.records import Event
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
@@ -19,7 +20,7 @@ from disco_hw.viewer.commands import snapshot_log
 from disco_hw.viewer.recording import Recording
 from sim.body_dynamics import BodyPose
 from tests.runtime.path_robot import path_robot
-from tests.runtime.simulated import replayed, simulated_stack, start, write_run, write_ticks
+from tests.runtime.simulated import recorded, replayed, simulated_stack, start, write_run, write_ticks
 
 CORNER = "x_m,y_m\n0,0\n1,0\n1,0.5\n"
 
@@ -59,8 +60,7 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     setup, stack = started(robot_file)
     places, _ = drive(stack, lambda: not stack.core.last.output.running, 20.0)
     stack.run(0.5)
-    reported = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
-    assert "task stopped: the end of the path is reached" in reported
+    assert "task stopped: the end of the path is reached" in [event.text for event in recorded(stack, Event)]
     assert stack.core.last.output.state is State.ARMED
     assert stack.core.last.pipeline.source is Source.HOLD
     assert abs(stack.robot.truth.left_speed_rad_s) < 0.05

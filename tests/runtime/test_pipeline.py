@@ -75,8 +75,7 @@ def run(pipeline: Pipeline, motions, start: int = 0):
 def test_standing_and_off_ask_for_zero():
     ticks = run(create_pipeline(Scripted()), [Off(), Standstill()])
     assert [tick.source for tick in ticks] == [Source.OFF, Source.HOLD]
-    assert all(tick.requested == (0.0, 0.0) for tick in ticks)
-    assert all(tick.plan is None for tick in ticks)
+    assert [(tick.requested, tick.plan) for tick in ticks] == [((0.0, 0.0), None)] * 2
 
 
 def test_a_plan_is_followed_within_the_acceleration_limit():
@@ -102,15 +101,11 @@ def test_a_planner_that_never_found_anything_moves_nothing():
     assert all(tick.command.left_rad_s == 0.0 for tick in ticks)
 
 
-def test_the_planner_starts_anew_after_every_pause():
+def test_the_planner_starts_anew_after_every_pause_which_no_old_plan_outlives():
     planner = Scripted(*[1.0] * 10)
     run(create_pipeline(planner), [Off(), FollowTask(), FollowTask(), Standstill(), FollowTask()])
     assert planner.resets == 2
-
-
-def test_an_old_plan_does_not_outlive_a_pause():
-    planner = Scripted(1.0)
-    ticks = run(create_pipeline(planner), [Off(), FollowTask(), Standstill(), FollowTask()])
+    ticks = run(create_pipeline(Scripted(1.0)), [Off(), FollowTask(), Standstill(), FollowTask()])
     assert ticks[3].source is Source.RAMP
 
 
@@ -145,12 +140,13 @@ def test_the_planner_sees_the_estimate_and_the_commands_sent():
     assert state.sent[-1].left_rad_s == pytest.approx(0.8)
 
 
-def test_the_history_of_commands_is_bounded_to_two_seconds():
+def test_the_history_of_commands_is_bounded_to_two_seconds_and_no_more_is_remembered_by_default():
     planner = Scripted(*[0.0] * 300)
     run(create_pipeline(planner), [Off(), *[FollowTask()] * 250])
-    sent = planner.states[-1].sent
-    assert sent[0].t_ns >= planner.states[-1].t_ns - 2_000_000_000 - PERIOD_NS
-    assert np.all(np.diff([command.t_ns for command in sent]) == PERIOD_NS)
+    state = planner.states[-1]
+    assert state.sent[0].t_ns >= state.t_ns - 2_000_000_000 - PERIOD_NS
+    assert np.all(np.diff([command.t_ns for command in state.sent]) == PERIOD_NS)
+    assert (state.command_means, state.body_means) == ((), ())
 
 
 def test_stages_are_marked_in_order():
@@ -160,12 +156,8 @@ def test_stages_are_marked_in_order():
 
 
 def test_what_terms_remember_is_kept_up_while_something_else_drives():
-    model = Model(
-        0.06, 0.4,
-        effects=tuple(
-            EffectSetting(name, {"k": 0.1}) for name in ("command += k u mean_30s(u^2)", "v_x += k (v - mean_3s(v))")
-        ),
-    )  # fmt: skip
+    terms = ("command += k u mean_30s(u^2)", "v_x += k (v - mean_3s(v))")
+    model = Model(0.06, 0.4, effects=tuple(EffectSetting(name, {"k": 0.1}) for name in terms))
     planner = Scripted(1.0)
     pipeline = create_pipeline(planner, means=DriveMeans.of(model))
     ticks, turned = [], 0.0
@@ -190,9 +182,3 @@ def test_what_terms_remember_is_kept_up_while_something_else_drives():
         total = both + (total - both) * math.exp(-0.02 / 3.0)
     assert state.body_means == pytest.approx((total,))
     assert total > 1.0
-
-
-def test_a_model_without_memory_gives_the_planner_none():
-    planner = Scripted(1.0)
-    run(create_pipeline(planner), [Off(), FollowTask()])
-    assert (planner.states[0].command_means, planner.states[0].body_means) == ((), ())

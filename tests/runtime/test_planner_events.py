@@ -30,7 +30,6 @@ def test_a_speed_that_the_wheels_limit_is_reported_once_in_a_drive() -> None:
 
 
 def test_a_speed_that_varies_a_little_is_not_reported() -> None:
-    """Only a part below the limit is."""
     events = PlannerEvents("ramp")
     assert events.step(Source.PLAN, _plan(LIMITED_PART), None) == ()
     assert events.step(Source.PLAN, _plan(LIMITED_PART - 0.01), None) != ()

@@ -1,8 +1,7 @@
 """The stack with poses by datagrams: a robot that is carried, a second sender, and headings that are no measurement."""
 
-import json
 import math
-import socket
+from contextlib import ExitStack, closing
 
 import msgspec
 import pytest
@@ -10,90 +9,24 @@ import pytest
 from disco_hw.daemon.control_socket import status
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample
 from tests.drive.test_hand_pilot import Hand
-from tests.drivers.waiting import free_port
-from tests.runtime.simulated import ROBOT_TEXT, arm, replayed, simulated_stack, start, write_run
+from tests.runtime.pose_bench import PoseBench
+from tests.runtime.simulated import arm, recorded, replayed, replies, robot_toml, simulated_stack, write_run
 from tests.tables import thinned
 from tools.faults.run import circling_planner
 
 
-class Sender:
-    """Tells by datagrams where the robot truly is, off by `off(t_s)` (m, east), at a rate; `said` changes a pose."""
-
-    def __init__(self, port, rate_hz, off=lambda t_s: 0.0, transform=lambda pose: pose):
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(("127.0.0.1", port))
-        self.name = "{}:{}".format(*self._socket.getsockname())
-        self._period_us, self._off, self._transform = round(1e6 / rate_hz), off, transform
-        self.is_silent = False
-
-    def step(self, now_us, truth):
-        if now_us % self._period_us == 0 and not self.is_silent:
-            pose = {"x_m": truth.x_m + self._off(now_us * 1e-6), "y_m": truth.y_m, "yaw_rad": truth.yaw_rad}
-            pose |= {"position_std_m": 0.005, "yaw_std_rad": 0.01, "age_s": 0.0}
-            self._socket.send(json.dumps(self._transform(pose)).encode())
-
-    def close(self):
-        self._socket.close()
-
-
-class Bench:
-    """The shipped robot on its circle of 0.75 m, without DISCO, which is not what is tried."""
-
-    def __init__(self, directory, lines=""):
-        self.port = free_port(socket.SOCK_DGRAM)
-        file = directory / "robot.toml"
-        file.write_text(f'{ROBOT_TEXT}\n[pose]\nsource = "udp"\nport = {self.port}\n{lines}', encoding="utf-8")
-        self.stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file, needs_pose=True)
-        self.senders = []
-        self._advance = self.stack.robot.advance
-        self.stack.robot.advance = self.advance
-
-    def advance(self, now_us):
-        self._advance(now_us)
-        for sender in self.senders:
-            sender.step(now_us, self.stack.robot.truth)
-
-    def send(self, *of, **more):
-        self.senders.append(Sender(self.port, *of, **more))
-        return self.senders[-1]
-
-    def start(self):
-        return start(self.stack, 0.5)[-1].output.running
-
-    def output_lines(self):
-        return [
-            record.text for _, tick in self.stack.recorder.ticks for record in tick if isinstance(record, records.Event)
-        ]
-
-    def error_m(self):
-        found, truth = self.stack.core.last.pipeline.estimate, self.stack.robot.truth
-        return math.hypot(found.x_m - truth.x_m, found.y_m - truth.y_m)
-
-
 @pytest.fixture
 def bench(tmp_path):
-    made = []
-
-    def create_bench(lines=""):
-        made.append(Bench(tmp_path, lines))
-        return made[-1]
-
-    yield create_bench
-    for one in made:
-        one.stack.core.pose_source.close()
-        for sender in one.senders:
-            sender.close()
-
-
-def containing(lines, fragment):
-    return [text for text in lines if fragment in text]
+    with ExitStack() as opened:
+        yield lambda lines="": opened.enter_context(
+            closing(PoseBench(tmp_path, f'[pose]\nsource = "udp"\nport = PORT\n{lines}'))
+        )
 
 
 @thinned("off_m", [1.0, -0.3], quick=1)
@@ -103,25 +36,22 @@ def test_a_robot_that_is_carried_stops_its_task_and_says_so_and_its_operator_sta
     made.send(25.0, lambda _t_s: off_m if carried else 0.0)
     assert made.start()
     assert made.stack.run(3.0)[-1].output.running
-    assert not containing(made.output_lines(), "jump")
+    assert not made.events("jump")
     carried.append(True)
     last = made.stack.run(2.0)[-1]
     assert not last.output.running
     assert last.command.left_rad_s == last.command.right_rad_s == 0.0
-    lines = made.output_lines()
-    (jump,) = containing(lines, "poses: the pose jumped by")
+    (jump,) = made.events("poses: the pose jumped by")
     assert f"by {abs(off_m):.2f} m" in jump
-    assert (
-        "which the motion of the wheels does not explain: the robot was carried or has slipped, or the measured poses"
-        in jump
-    )
-    (stop,) = containing(lines, "task stopped: the pose jumped by")
+    why = "which the motion of the wheels does not explain: the robot was carried or has slipped, or the measured poses"
+    assert why in jump
+    (stop,) = made.events("task stopped: the pose jumped by")
     assert stop.endswith("check that the robot is where the page shows it, then start again")
-    (mismatch,) = containing(lines, "poses: 3 poses in a row disagree with the wheels")
+    (mismatch,) = made.events("poses: 3 poses in a row disagree with the wheels")
     assert f"{abs(off_m):.2f} m, and are not used" in mismatch
     # It never goes on by itself.
     assert not made.stack.run(3.0)[-1].output.running
-    (reply,) = [reply for tick in made.stack.run(0.1, UserRequest.START) for reply in tick.output.replies]
+    (reply,) = replies(made.stack.run(0.1, UserRequest.START))
     assert reply.accepted
     assert made.stack.run(1.0)[-1].output.running
 
@@ -133,7 +63,7 @@ def test_a_jump_while_nothing_runs_is_said_and_keeps_nobody_from_starting_later(
     made.stack.run(1.5)
     carried.append(True)
     made.stack.run(1.0)
-    assert containing(made.output_lines(), "poses: the pose jumped by 1.00 m")
+    assert made.events("poses: the pose jumped by 1.00 m")
     made.stack.run(0.5, UserRequest.ARM)
     assert made.stack.run(0.5, UserRequest.START)[-1].output.running
 
@@ -151,7 +81,7 @@ def test_a_second_sender_is_refused_and_named_and_the_robot_stays_on_its_circle(
     last = made.stack.run(6.0)[-1]
     assert last.output.running
     assert made.error_m() < 0.05
-    (named,) = containing(made.output_lines(), f"poses: {stranger.name} sends poses while {first.name} does: not used")
+    (named,) = made.events(f"poses: {stranger.name} sends poses while {first.name} does: not used")
     assert f"stop one of them; {first.name} is used until it has sent nothing for 2 s" in named
     assert made.stack.core.pose_source.refused > 5.0 * stranger_hz
     assert made.stack.core.pipeline.fusion.stats.poses_gated <= 2
@@ -166,11 +96,9 @@ def test_another_sender_takes_over_only_after_the_task_has_stopped_for_want_of_p
     first.is_silent = True
     seen = made.stack.run(4.0)
     assert not seen[-1].output.running
-    lines = made.output_lines()
+    lines = made.events()
     stopped = lines.index("task stopped: no valid pose; check the pose sensor, or set estimation.pose_required = false")
-    (takeover,) = containing(
-        lines, f"poses: poses now come from {second.name}; {first.name} has sent nothing for 2.0 s"
-    )
+    (takeover,) = made.events(f"poses: poses now come from {second.name}; {first.name} has sent nothing for 2.0 s")
     assert stopped < lines.index(takeover)
     assert seen[-1].pipeline.estimate.pose_ok
 
@@ -179,33 +107,29 @@ def test_only_allowed_addresses_may_send(bench):
     made = bench('allow = ["10.0.0.0/8"]\n')
     sender = made.send(25.0)
     assert not made.start()
-    (line,) = containing(made.output_lines(), "is not in pose.allow")
+    (line,) = made.events("is not in pose.allow")
     assert line.startswith(f"poses: {sender.name} sends poses but is not in pose.allow: not used (1 datagrams)")
 
 
-def constant(yaw_rad):
-    return lambda pose: {**pose, "yaw_rad": yaw_rad}
-
-
 @thinned(
-    "transform",
+    "heading",
     [
-        lambda pose: {**pose, "yaw_rad": 0.0, "yaw_std_rad": 0.0},
-        lambda pose: {**pose, "yaw_rad": 0.3, "yaw_std_rad": -1.0},
-        lambda pose: {**pose, "yaw_rad": 0.3, "yaw_std_rad": 316.0},
+        {"yaw_rad": 0.0, "yaw_std_rad": 0.0},
+        {"yaw_rad": 0.3, "yaw_std_rad": -1.0},
+        {"yaw_rad": 0.3, "yaw_std_rad": 316.0},
     ],
     ids=["identity", "minus one", "large"],
     quick=1,
 )
-def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_told(bench, transform):
+def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_told(bench, heading):
     made = bench()
-    made.send(25.0, transform=transform)
+    made.send(25.0, transform=lambda pose: {**pose, **heading})
     assert not made.start()
     last = made.stack.core.last
     assert (last.pipeline.estimate.initialised, last.pipeline.estimate.heading_known) == (True, False)
     assert last.output.detail == "armed, commanding zero speed"
     assert made.error_m() < 0.05
-    (line,) = containing(made.output_lines(), "only the positions are used")
+    (line,) = made.events("only the positions are used")
     assert line.startswith("poses: udp: its poses have no heading, or a covariance that marks it as unknown")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "none"
 
@@ -213,12 +137,12 @@ def test_a_heading_that_is_said_to_be_unknown_is_not_used_and_the_operator_is_to
 def test_a_heading_that_never_moves_is_found_out_by_the_first_turn_and_the_estimate_forgets_it(bench):
     """At first it fits: the circle begins with it."""
     made = bench()
-    made.send(25.0, transform=constant(0.5 * math.pi))
+    made.send(25.0, transform=lambda pose: {**pose, "yaw_rad": 0.5 * math.pi})
     assert made.start()
     last = made.stack.run(3.0)[-1]
     assert not last.output.running
     assert not last.pipeline.estimate.heading_known
-    (line,) = containing(made.output_lines(), "the heading stays at 1.57 rad while the wheels turn the robot by")
+    (line,) = made.events("the heading stays at 1.57 rad while the wheels turn the robot by")
     assert line.endswith("only the positions are used; check the pose sensor")
     assert status(made.stack.core, {}, RecorderStats())["poses"][0]["heading"] == "stands still"
 
@@ -238,11 +162,11 @@ def test_a_heading_sensor_that_dies_is_left_out_and_the_drive_goes_on_by_positio
     made.send(25.0, transform=with_dead_heading)
     assert made.start()
     last = made.stack.run(10.0)[-1]
-    assert containing(made.output_lines(), "udp: the heading stays at")
-    assert last.output.running, made.output_lines()
+    assert made.events("udp: the heading stays at")
+    assert last.output.running, made.events()
     assert made.error_m() < 0.05
     last = made.stack.run(5.0)[-1]
-    assert containing(made.output_lines(), "udp: its headings are used again")
+    assert made.events("udp: its headings are used again")
     assert last.output.running
     assert made.error_m() < 0.03
 
@@ -264,13 +188,11 @@ def test_a_drive_whose_heading_is_left_out_on_the_way_is_replayed_bit_for_bit(tm
     assert (found.reinitialisations, found.heading_known) == (1, True)
     assert abs(math.remainder(found.yaw_rad - truth.yaw_rad, math.tau)) < 0.2
     replayed(write_run(stack, tmp_path / "run.mcap"))
-    recorded = [one for _, tick in stack.recorder.ticks for one in tick if isinstance(one, PoseSample)]
-    assert {pose.yaw_rad for pose in recorded} == {1.5}
+    assert {pose.yaw_rad for pose in recorded(stack, PoseSample)} == {1.5}
 
 
 def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_the_task(tmp_path):
-    file = tmp_path / "robot.toml"
-    file.write_text(f"{ROBOT_TEXT}\n[estimation]\npose_required = false\n", encoding="utf-8")
+    file = robot_toml(tmp_path, "[estimation]\npose_required = false\n")
     stack = simulated_stack(circling_planner(load_setup(file)), robot_file=file)
     received, enabled = stack.core.pose_source.receive, []
     stack.core.pose_source.receive = lambda now_ns, poses: received(now_ns, poses) if enabled else []
@@ -279,4 +201,4 @@ def test_a_first_pose_that_is_not_where_the_wheels_led_to_from_the_origin_stops_
     enabled.append(True)
     seen = stack.run(0.5)
     assert not seen[-1].output.running
-    assert containing([event for tick in seen for event in tick.events], "task stopped: the pose jumped by")
+    assert any("task stopped: the pose jumped by" in event for tick in seen for event in tick.events)

@@ -15,7 +15,7 @@ from drivers.pose import PoseSourceError
 from drivers.pose.robot import RobotPoses
 from drivers.types import PoseSample, WheelSample
 from tests.drive.test_hand_pilot import Hand
-from tests.runtime.simulated import ROBOT_FILE, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, recorded, replies, simulated_stack
 
 
 class Elsewhere:
@@ -31,14 +31,10 @@ class Elsewhere:
 def test_the_estimate_rests_on_the_sources_poses_in_place_of_the_robots(monkeypatch):
     monkeypatch.setattr(assembly, "pose_source_of", lambda _config: Elsewhere())
     stack = simulated_stack(planner=NoPlanner())
-    last = stack.run(1.0)[-1]
-    estimate = last.pipeline.estimate
+
+    estimate = stack.run(1.0)[-1].pipeline.estimate
     assert (estimate.x_m, estimate.y_m, estimate.yaw_rad) == pytest.approx((7.0, -3.0, 0.5), abs=1e-3)
     assert estimate.pose_ok
-
-
-def recorded(stack, kind):
-    return [record for _, records in stack.recorder.ticks for record in records if isinstance(record, kind)]
 
 
 def test_without_poses_the_robot_is_driven_by_hand_and_recorded(monkeypatch):
@@ -63,7 +59,7 @@ def test_without_wheels_poses_are_recorded_and_nothing_is_armed(monkeypatch):
     stack.core.pose_source = Elsewhere()
     stack.pilot = HandPilot(Hand(), Coverage(8.0))
     stack.run(1.5)
-    (reply,) = [reply for tick in stack.run(0.1, UserRequest.ARM) for reply in tick.output.replies]
+    (reply,) = replies(stack.run(0.1, UserRequest.ARM))
     assert (reply.accepted, reply.text) == (
         False,
         "not connected to the robot: the robot sends no wheel data; check the encoders and the controller",

@@ -37,12 +37,11 @@ def ticks():
 def write_log(
     path: Path, ticks, robot: str | None = None, model: str | None = None, planner: int = PLANNER_VERSION
 ) -> Path:
-    robot = robot or (ROBOTS / "wombot.toml").read_text()
-    model = model or (ROBOTS / "wombot_model.toml").read_text()
-    attachments = (
-        Attachment(ROBOT_TOML, "application/toml", robot.encode()),
-        Attachment(MODEL_TOML, "application/toml", model.encode()),
-    )
+    texts = {
+        ROBOT_TOML: robot or (ROBOTS / "wombot.toml").read_text(),
+        MODEL_TOML: model or (ROBOTS / "wombot_model.toml").read_text(),
+    }
+    attachments = [Attachment(name, "application/toml", text.encode()) for name, text in texts.items()]
     return write_ticks(path, ticks, attachments, planner)
 
 
@@ -128,37 +127,34 @@ def test_another_robot_shows_where_it_first_differs(tmp_path, ticks, file, old, 
     assert "first difference at tick" in report.as_text()
 
 
-def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
-    def shifted(record):
-        if not isinstance(record, Command):
-            return record
-        return structs.replace(record, left_rad_s=record.left_rad_s + 2.0**-40)
+def altered(ticks, kind, change, at=None):
+    """The ticks with another record of this kind, or without it for None: in one tick, or in all."""
 
-    changed = list(ticks)
-    changed[150] = (ticks[150][0], tuple(map(shifted, ticks[150][1])))
+    def records_of(records):
+        changed = (change(record) if isinstance(record, kind) else record for record in records)
+        return tuple(record for record in changed if record is not None)
+
+    return [(t_ns, records_of(records) if at in (None, k) else records) for k, (t_ns, records) in enumerate(ticks)]
+
+
+def test_one_changed_bit_in_the_log_is_found(tmp_path, ticks):
+    changed = altered(ticks, Command, lambda one: structs.replace(one, left_rad_s=one.left_rad_s + 2.0**-40), at=150)
     report = replay(write_log(tmp_path / "run.mcap", changed))
     assert not report.ok
-    assert report.difference.field == "Command.left_rad_s"
-    assert report.difference.t_ns == ticks[150][0]
+    assert (report.difference.field, report.difference.t_ns) == ("Command.left_rad_s", ticks[150][0])
 
 
 def test_within_a_tolerance_a_plan_that_is_a_step_shorter_is_a_difference(tmp_path, ticks):
-    def shortened(record):
-        return structs.replace(record, left_rad_s=record.left_rad_s[:-1]) if isinstance(record, Plan) else record
-
-    changed = [(t_ns, tuple(map(shortened, records))) for t_ns, records in ticks]
-    report = replay(write_log(tmp_path / "run.mcap", changed), 1.0)
-    assert report.difference.field == "Plan.left_rad_s"
+    changed = altered(ticks, Plan, lambda one: structs.replace(one, left_rad_s=one.left_rad_s[:-1]))
+    assert replay(write_log(tmp_path / "run.mcap", changed), 1.0).difference.field == "Plan.left_rad_s"
 
 
 def test_a_record_that_the_log_lacks_is_a_difference(tmp_path, ticks):
-    changed = list(ticks)
-    t_ns, records = ticks[150]
-    changed[150] = t_ns, tuple(record for record in records if not isinstance(record, Command))
-    report = replay(write_log(tmp_path / "run.mcap", changed))
-    assert (report.difference.field, report.difference.t_ns) == ("records", t_ns)
-    assert "Command" not in report.difference.recorded
-    assert "Command" in report.difference.replayed
+    changed = altered(ticks, Command, lambda _: None, at=150)
+    found = replay(write_log(tmp_path / "run.mcap", changed)).difference
+    assert (found.field, found.t_ns) == ("records", ticks[150][0])
+    assert "Command" not in found.recorded
+    assert "Command" in found.replayed
 
 
 def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_path, ticks):

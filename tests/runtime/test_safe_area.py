@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import socket
 from pathlib import Path
 
@@ -36,13 +35,14 @@ from disco_hw.runtime.supervisor import UserRequest
 from drivers.pose.senders import RefusedDatagrams
 from sim.body_dynamics import BodyPose
 from sim.plant_parameters import PlantParameters
-from tests.runtime.simulated import arm, replayed, write_run
+from tests.drivers.waiting import free_port
+from tests.runtime.simulated import ROBOT_TEXT, arm, recorded, replayed, write_run
 
-ROBOTS = SHIPPED_ROBOT.parent
 ROOM = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
 FENCE = "\n[fence]\nkeep_in = [[-2, -1.5], [2, -1.5], [2, 1.5], [-2, 1.5]]\n"
 SECOND_NS = 1_000_000_000
 MIDDLE = BodyPose(0.0, 0.0, 0.0)
+BOX = {"name": "box", "x_m": 0.0, "y_m": 0.0, "radius_m": 0.1}
 
 
 class Hand:
@@ -78,21 +78,17 @@ class FewObstacles:
 
 @pytest.fixture(scope="module")
 def robot_file(tmp_path_factory) -> Path:
-    directory = tmp_path_factory.mktemp("fenced")
-    path = directory / "robot.toml"
-    text = (ROBOTS / "wombot.toml").read_text()
+    path = tmp_path_factory.mktemp("fenced") / "robot.toml"
     # The controller brakes twice as hard as the robot may.
-    gentle = text.replace("max_wheel_acceleration_rad_s2 = 20.0", "max_wheel_acceleration_rad_s2 = 10.0")
-    assert gentle != text
+    gentle = ROBOT_TEXT.replace("max_wheel_acceleration_rad_s2 = 20.0", "max_wheel_acceleration_rad_s2 = 10.0")
+    assert gentle != ROBOT_TEXT
     path.write_text(gentle + FENCE)
-    shutil.copy(ROBOTS / "wombot_model.toml", directory)
     return path
 
 
 def by_hand(robot_file: Path, start: BodyPose = MIDDLE, **plant) -> tuple[SimulatedRun, Hand]:
     setup, hand = load_setup(robot_file), Hand()
-    robot = virtual_robot(setup, PlantParameters(**plant), start)
-    run = SimulatedRun(setup, robot, NoPlanner(), hand)
+    run = SimulatedRun(setup, virtual_robot(setup, PlantParameters(**plant), start), NoPlanner(), hand)
     arm(run)
     run.run(0.02, UserRequest.START)
     return run, hand
@@ -104,8 +100,8 @@ def left_m(run: SimulatedRun) -> float:
     return float(bounds.clearance_m(np.array([[truth.x_m, truth.y_m, truth.yaw_rad]]))[0])
 
 
-def events_of(ticks) -> list[str]:
-    return [event for tick in ticks for event in tick.events if event.startswith("fence:")]
+def events_of(ticks, of: str = "fence:") -> list[str]:
+    return [event for tick in ticks for event in tick.events if event.startswith(of)]
 
 
 def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path):
@@ -123,12 +119,11 @@ def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path
     ticks = run.run(1.0)
     assert events_of(ticks) == ["fence: motion is allowed again"]
     assert left_m(run) > 0.2
-    guards = [one for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.GuardVerdict)]
+    guards = recorded(run, records.GuardVerdict)
     assert {"free", "scaled", "stopped"} <= {one.verdict for one in guards}
     assert sum(bool(one.path_x_m) for one in guards) > len(guards) / 6
-    log = tmp_path / "run.mcap"
-    run.write_log(log)
-    replayed(log)
+    run.write_log(tmp_path / "run.mcap")
+    replayed(tmp_path / "run.mcap")
 
 
 def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file):
@@ -144,8 +139,7 @@ def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(5.0, 5.0))
     ticks = run.run(1.0)
     assert not ticks[-1].output.running
-    stop_events = [event for tick in ticks for event in tick.events if event.startswith("task stopped")]
-    (event,) = stop_events
+    (event,) = events_of(ticks, "task stopped")
     assert event.startswith("task stopped: fence: the stopping path would leave the fence at (0.")
     assert ticks[-1].output.state is State.ARMED
 
@@ -162,9 +156,7 @@ def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
     assert ticks[-1].command.left_rad_s == pytest.approx(3.0)
     assert events_of(ticks)[0].startswith("fence: OVERRIDDEN by the operator")
     assert run.core.area.status(run.now_us * 1000)["overridden_s"] == pytest.approx(59.0, abs=0.1)
-    assert any(
-        one.overridden for _, tick in run.recorder.ticks for one in tick if isinstance(one, records.GuardVerdict)
-    )
+    assert any(one.overridden for one in recorded(run, records.GuardVerdict))
     # It is the hand's alone.
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0))
     assert run.run(1.0)[-1].command.left_rad_s == 0.0
@@ -252,18 +244,17 @@ def test_thirty_two_obstacles_are_kept_and_no_more():
     ],
 )  # fmt: skip
 def test_what_is_no_obstacle_is_refused_in_one_line(fields):
-    valid = {"name": "box", "x_m": 0.0, "y_m": 0.0, "radius_m": 0.1}
-    assert report_from(valid).age_limit_s == 1.0
+    assert report_from(BOX).age_limit_s == 1.0
     with pytest.raises(ObstacleRefused, match=r"obstacle: .*; write"):
-        report_from({**valid, **fields})
+        report_from(BOX | fields)
     with pytest.raises(ObstacleRefused):
-        reports_in(msgspec.json.encode({**valid, **fields}))
+        reports_in(msgspec.json.encode(BOX | fields))
 
 
 def test_datagrams_of_one_and_of_several_are_taken():
-    one = {"name": "box", "x_m": 0.0, "y_m": 1.0, "radius_m": 0.1}
+    one = BOX | {"y_m": 1.0}
     assert [each.name for each in reports_in(msgspec.json.encode(one))] == ["box"]
-    many = [{**one, "name": f"box{k}"} for k in range(40)]
+    many = [BOX | {"name": f"box{k}"} for k in range(40)]
     assert len(reports_in(msgspec.json.encode(many))) == 40
     assert [each.y_m for each in reports_in(msgspec.msgpack.encode([one]))] == [1.0]
     for garbage in (b"", b"{", b"[1]", b"\xff\xff", b"{}" * 3):
@@ -272,10 +263,7 @@ def test_datagrams_of_one_and_of_several_are_taken():
 
 
 def test_reports_come_over_udp_and_of_what_is_not_used_it_is_said_why(robot_file):
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    config = load_setup(robot_file).config
+    port, config = free_port(socket.SOCK_DGRAM), load_setup(robot_file).config
     fence = msgspec.structs.replace(config.fence, obstacles_port=port)
     source = obstacle_source_of(msgspec.structs.replace(config, fence=fence))
     assert isinstance(source, UdpObstacles)
@@ -287,7 +275,7 @@ def test_reports_come_over_udp_and_of_what_is_not_used_it_is_said_why(robot_file
             assert list(source.receive(0)) == []
             (text,) = source.refused.new_messages()
             assert f"127.0.0.1:{sender.getsockname()[1]} sends what is no report of obstacles (" in text
-            many = [{"name": f"box{k}", "x_m": 0.5, "y_m": 0.0, "radius_m": 0.1} for k in range(MOST_OBSTACLES + 2)]
+            many = [BOX | {"name": f"box{k}"} for k in range(MOST_OBSTACLES + 2)]
             sender.sendto(msgspec.msgpack.encode(many), ("127.0.0.1", port))
             assert len(source.receive(10_000_000_000)) == MOST_OBSTACLES
         (text,) = source.refused.new_messages()
@@ -301,12 +289,8 @@ def test_reports_come_over_udp_and_of_what_is_not_used_it_is_said_why(robot_file
 
 def test_of_an_obstacle_that_is_one_too_many_an_event_says_so(robot_file):
     run, _ = by_hand(robot_file)
-    source = FewObstacles(
-        [report_from({"name": f"box{k}", "x_m": 9.0, "y_m": 9.0, "radius_m": 0.1}) for k in range(33)]
-    )
-    run.core.obstacle_source = source
-    events = events_of(run.run(0.1))
-    assert [event for event in events if "box32" in event] == [
+    run.core.obstacle_source = FewObstacles([report(f"box{k}", x_m=9.0, y_m=9.0) for k in range(33)])
+    assert [event for event in events_of(run.run(0.1)) if "box32" in event] == [
         "fence: obstacle box32: not used (1 datagrams); there may be 32; report the nearest ones"
     ]
 
@@ -345,11 +329,7 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     from disco_hw.errors import InputError
     from disco_hw.first_use.fence_drive import fence_of_log, fence_toml
 
-    setup = load_setup(ROBOTS / "wombot.toml")
-    hand = Hand()
-    run = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), hand)
-    arm(run)
-    run.run(0.02, UserRequest.START)
+    run, hand = by_hand(SHIPPED_ROBOT)
     hand.wheels = (1.0, 6.0)
     log = tmp_path / "edge.mcap"
     turned, before = 0.0, run.robot.truth.yaw_rad
@@ -361,6 +341,7 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     write_run(run, log)
     text = fence_toml(fence_of_log(log))
     assert text.startswith("[fence]\nkeep_in = [[")
+    setup = load_setup(SHIPPED_ROBOT)
     short = SimulatedRun(setup, virtual_robot(setup, PlantParameters(), MIDDLE), NoPlanner(), Hand())
     short.run(0.1)
     write_run(short, tmp_path / "short.mcap")

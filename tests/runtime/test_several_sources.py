@@ -1,7 +1,7 @@
 """The stack with two pose sources in robot.toml: the robot's own poses, and datagrams through a real socket."""
 
-import json
 import socket
+from contextlib import closing
 
 import pytest
 
@@ -9,77 +9,45 @@ from disco_hw.config import load_robot_config
 from disco_hw.daemon.check import pose_source_checks
 from disco_hw.daemon.control_socket import counters, status
 from disco_hw.errors import InputError
-from disco_hw.log import records
 from disco_hw.log.load import load_drive
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.assembly import create_planner, pose_source_of
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.types import PoseSample
-from tests.runtime.simulated import ROBOT_FILE, ROBOT_TEXT, replayed, simulated_stack, start, write_run
+from tests.drivers.waiting import free_port
+from tests.runtime.pose_bench import PoseBench
+from tests.runtime.simulated import ROBOT_FILE, recorded, replayed, robot_toml, write_run
 
 
-@pytest.fixture
-def port():
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
-        opened.bind(("127.0.0.1", 0))
-        return opened.getsockname()[1]
+class Bench(PoseBench):
+    """The stack on its circle; datagrams say where the robot truly is, `off_m` east of it."""
 
-
-def robot_toml(directory, lines):
-    path = directory / "robot.toml"
-    path.write_text(f"{ROBOT_TEXT}\n{lines}", encoding="utf-8")
-    return path
-
-
-class Bench:
-    """The stack on its circle; datagrams say where the robot truly is, `off_m` east of it, or nothing for None."""
-
-    def __init__(self, directory, port):
-        also = f'[[pose.also]]\nsource = "udp"\nport = {port}\norigin = [1.0, 0.0, 0.0]\n'
-        file = robot_toml(directory, f'[pose]\nsource = "robot"\n{also}')
-        setup = load_setup(file)
-        self.stack = simulated_stack(create_planner(setup.config, setup.model), robot_file=file)
+    def __init__(self, directory):
+        also = '[[pose.also]]\nsource = "udp"\nport = PORT\norigin = [1.0, 0.0, 0.0]\n'
+        super().__init__(directory, f'[pose]\nsource = "robot"\n{also}', planner_of)
         self.off_m = 0.0
-        self._sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._sender.connect(("127.0.0.1", port))
-        self._advance = self.stack.robot.advance
-        self.stack.robot.advance = self.advance
-
-    def advance(self, now_us):
-        self._advance(now_us)
-        if now_us % 100_000 == 0 and self.off_m is not None:
-            truth = self.stack.robot.truth
-            datagram = {"x_m": truth.x_m + self.off_m - 1.0, "y_m": truth.y_m, "position_std_m": 0.02, "age_s": 0.0}
-            self._sender.send(json.dumps(datagram).encode())
-
-    def start(self):
-        return start(self.stack, 1.0)[-1].output.running
-
-    def close(self):
-        self._sender.close()
-        self.stack.core.pose_source.close()
-
-    def output_lines(self):
-        return " | ".join(
-            record.text for _, tick in self.stack.recorder.ticks for record in tick if isinstance(record, records.Event)
-        )
+        position = {"position_std_m": 0.02, "age_s": 0.0}
+        self.send(10.0, lambda _: self.off_m - 1.0, lambda pose: {"x_m": pose["x_m"], "y_m": pose["y_m"], **position})
 
     def poses(self):
-        return [sample for _, tick in self.stack.recorder.ticks for sample in tick if isinstance(sample, PoseSample)]
+        return recorded(self.stack, PoseSample)
+
+
+def planner_of(setup):
+    return create_planner(setup.config, setup.model)
 
 
 @pytest.fixture
-def bench(tmp_path, port):
-    made = Bench(tmp_path, port)
-    yield made
-    made.close()
+def bench(tmp_path):
+    with closing(Bench(tmp_path)) as made:
+        yield made
 
 
 def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path):
-    assert bench.start()
+    assert bench.start(1.0)
     bench.off_m = 0.6
     bench.stack.run(1.5)
-    bench.off_m = None
+    bench.senders[0].is_silent = True
     last = bench.stack.run(1.5)[-1]
     assert last.output.running
     now = status(bench.stack.core, {}, RecorderStats())["poses"]
@@ -88,11 +56,9 @@ def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path)
     assert now[1]["origin"] == [1.0, 0.0, 0.0]
     assert now[1]["outliers"] >= 12
     assert now[0]["latency_s"] == pytest.approx(0.03, abs=0.02)
-    assert (
-        "poses: udp: its poses jumped, which the wheels do not explain, and are not used; continuing with robot"
-        in bench.output_lines()
-    )
-    assert "poses: udp: no pose for 1 s; continuing with robot" in bench.output_lines()
+    jumped = "poses: udp: its poses jumped, which the wheels do not explain, and are not used; continuing with robot"
+    assert bench.events(jumped)
+    assert bench.events("poses: udp: no pose for 1 s; continuing with robot")
     assert {pose.source for pose in bench.poses()} == {0, 1}
     log = write_run(bench.stack, tmp_path / "run.mcap")
     replayed(log)
@@ -101,8 +67,7 @@ def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path)
 
 
 def test_two_that_contradict_each_other_stop_the_task_and_say_so(bench):
-    bench.off_m = 0.0
-    assert bench.start()
+    assert bench.start(1.0)
     for tenth in range(40):
         bench.off_m = 0.005 * tenth
         if not bench.stack.run(0.1)[-1].output.running:
@@ -110,7 +75,7 @@ def test_two_that_contradict_each_other_stop_the_task_and_say_so(bench):
     assert not bench.stack.core.last.output.running
     why = "udp and robot disagree by more than their stated noise"
     hint = "find the source that is wrong and remove it from [pose] in robot.toml"
-    assert f"task stopped: {why}; {hint}" in bench.output_lines()
+    assert bench.events(f"task stopped: {why}; {hint}")
 
 
 def test_what_is_learnt_is_learnt_from_the_first_alone(bench):
@@ -155,7 +120,8 @@ def test_a_further_source_that_is_wrong_is_one_line(tmp_path, lines, message):
         load_robot_config(robot_toml(tmp_path, lines))
 
 
-def test_two_of_one_kind_are_numbered_and_a_port_taken_twice_is_said(tmp_path, port):
+def test_two_of_one_kind_are_numbered_and_a_port_taken_twice_is_said(tmp_path):
+    port = free_port(socket.SOCK_DGRAM)
     lines = f'[pose]\nsource = "udp"\nport = {port}\n[[pose.also]]\nsource = "udp"\nport = {port}\n'
     config = load_robot_config(robot_toml(tmp_path, lines))
     assert config.pose.labels() == ("udp 1", "udp 2")
@@ -185,10 +151,10 @@ def test_check_shows_each_and_that_two_disagree(tmp_path):
     assert last.text.startswith("0.40 rad apart,")
 
 
-@pytest.mark.parametrize("where", ["", "[[pose.also]]\n"])
-def test_a_key_beside_robot_toml_is_read_and_one_that_others_can_read_or_is_none_is_refused(tmp_path, port, where):
-    robot = "" if where else "[pose]\n"
-    file = robot_toml(tmp_path, f'{robot}{where}source = "udp"\nport = {port}\nkey_file = "pose.key"\n')
+@pytest.mark.parametrize("where", ["[pose]\n", "[[pose.also]]\n"])
+def test_a_key_beside_robot_toml_is_read_and_one_that_others_can_read_or_is_none_is_refused(tmp_path, where):
+    port = free_port(socket.SOCK_DGRAM)
+    file = robot_toml(tmp_path, f'{where}source = "udp"\nport = {port}\nkey_file = "pose.key"\n')
     key = tmp_path / "pose.key"
     with pytest.raises(InputError, match=r"pose\.source.*: .*pose\.key: .*make one with"):
         pose_source_of(load_setup(file).config)

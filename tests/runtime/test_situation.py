@@ -85,7 +85,8 @@ def test_a_fault_and_a_latched_stop_come_before_everything_else():
     assert advice({**STATUS, "robot_state": "ESTOP"}) == both[:1]
 
 
-def test_an_unknown_fault_is_reported_too():
+def test_codes_are_said_in_words_also_of_an_unknown_fault():
+    assert describe("OVER_CURRENT_RIGHT") == "Over current right"
     assert advice({**STATUS, "fault": "NEW_TROUBLE"})[0].startswith("New trouble. This version does not know the fault")
 
 
@@ -94,10 +95,6 @@ def test_driving_by_hand_has_its_own_words():
     assert advice(status) == ("hold the pad",)
     assert next_step(status) == ""
     assert advice({**status, "state": "FAULT", "fault": "BUS_OFF"})[0].startswith("Bus off.")
-
-
-def test_codes_in_words():
-    assert describe("OVER_CURRENT_RIGHT") == "Over current right"
 
 
 def test_who_has_just_armed_is_not_sent_to_arm_again():

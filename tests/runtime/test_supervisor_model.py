@@ -10,7 +10,7 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
 
-from disco_hw.runtime import State
+from disco_hw.runtime import TRANSITIONS, State
 from disco_hw.runtime.supervisor import Inputs, Supervisor, SupervisorSettings, UserRequest
 from drivers.types import DriverState, LinkState, Request
 
@@ -33,6 +33,7 @@ VALUES = {
     "wheel_speed_rad_s": st.sampled_from([0.0, 0.049, 0.05, 3.0, float("nan")]),
     "pose_ok": st.booleans(),
     "heading_missing": st.booleans(),
+    "by_hand": st.booleans(),
     "preflight_errors": st.sampled_from([(), ("limits differ",)]),
     "recording_fault": st.sampled_from(["", "no room"]),
 }
@@ -108,7 +109,12 @@ class SupervisorModel(RuleBasedStateMachine):
         before = self.history[-1][1].state if self.history else State.DISCONNECTED
         output = self.supervisor.step(self.now_ns, inputs)
         self.history.append((inputs, output))
+        assert output.detail
         assert len(output.replies) == len(requests)
+        assert all(reply.text for reply in output.replies)
+        if output.state is not before:
+            assert any(before in row.sources and row.target is output.state for row in TRANSITIONS)
+            assert output.events
         self.check_state(before, output.state, inputs)
         self.check_motion(inputs, output)
         self.check_requests(output)
@@ -191,8 +197,7 @@ class SupervisorModel(RuleBasedStateMachine):
             assert output.state is State.ARMED
             assert inputs.driver_state is DriverState.ARMED
             assert fresh(inputs)
-            assert inputs.pose_ok
-            assert not inputs.heading_missing
+            assert inputs.by_hand or (inputs.pose_ok and not inputs.heading_missing)
             assert not troubled(inputs)
             assert not self.is_estop_latched()
             # Between the last time that it was not armed and now, somebody asked for it: arming, then starting.

@@ -8,13 +8,14 @@ import pytest
 from disco_hw.daemon.control_socket import loop_figures, status
 from disco_hw.daemon.loop import LoopStats
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.log.records import Event
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.timed_path import TimedPathTask
 from disco_hw.viewer.recording import Recording
 from tests.runtime.path_robot import timed_path_robot
-from tests.runtime.simulated import replayed, write_run
+from tests.runtime.simulated import recorded, replayed, write_run
 from tests.runtime.test_path_drive import drive, started
 from tests.tasks.costs import instant_cost
 
@@ -38,8 +39,7 @@ def test_way_points_are_met_at_their_times_to_the_end_and_replayed_and_shown_wit
     assert np.hypot(*(places[240:290] - (0.9, 0.0)).T).max() < 0.1
     assert 11.0 < 0.02 * len(places) < 14.0
     assert np.hypot(*(places[-1] - (1.4, 0.7))) < 0.08
-    reported = [text for _, tick in stack.recorder.ticks for text in (getattr(r, "text", "") for r in tick)]
-    assert "task stopped: the end of the path is reached" in reported
+    assert "task stopped: the end of the path is reached" in [event.text for event in recorded(stack, Event)]
     stack.run(0.5)
     assert stack.core.last.output.state is State.ARMED
     assert stack.core.last.pipeline.source is Source.HOLD

@@ -160,18 +160,13 @@ def test_a_dead_band_is_known_as_well_after_a_stop_as_before(dead_rad_s, lag_s):
     assert robot.drive(12.0, turns_stops_and_curves) is None
     assert robot.faults.not_following == 0
     # And a wheel that ceases to turn then is found.
-    found = robot.drive(3.0, (1.6, 2.82), turns=lambda target: 0.0)
-    assert found is not None
-
-
-def swinging(time_s):
-    return 3.0 * math.sin(2.5 * time_s), 4.0 * math.sin(1.7 * time_s)
+    assert robot.drive(3.0, (1.6, 2.82), turns=lambda target: 0.0) is not None
 
 
 @pytest.mark.parametrize("lag_s", [0.02, 0.1, 0.3])
 def test_wheels_that_lag_behind_swinging_commands_follow_them(lag_s):
     robot = Robot(lag_s=lag_s)
-    assert robot.drive(12.0, swinging) is None
+    assert robot.drive(12.0, lambda t_s: (3.0 * math.sin(2.5 * t_s), 4.0 * math.sin(1.7 * t_s))) is None
     assert robot.faults.not_following == 0
 
 
@@ -212,20 +207,16 @@ def test_disarmed_nothing_is_expected():
         assert robot.faults.step(now_ns, [WheelSample(now_ns, now_ns, *robot.counts, 0.0, 0.0)], [], GEOMETRY) is None
 
 
-def test_a_base_that_makes_wheel_speeds_of_its_own_may_turn_by_more():
-    def turned(commanded):
-        mean = sum(commanded) / 2
-        return tuple(mean + 1.5 * (each - mean) for each in commanded)
-
-    for takes_body_speeds, is_left_alone in ((True, True), (False, False)):
-        robot = Robot(faults=WheelFaults(takes_body_speeds))
-        robot.drive(4.0, (3.0, 3.0))
-        commanded = (0.6, 3.5)
-        move = robot._move
-        robot._move = lambda _commanded, turns, counts, move=move, commanded=commanded: move(
-            turned(commanded), turns, counts
-        )
-        assert (robot.drive(2.0, commanded) is None) is is_left_alone
+@pytest.mark.parametrize("takes_body_speeds", [True, False])
+def test_a_base_that_makes_wheel_speeds_of_its_own_may_turn_by_more(takes_body_speeds):
+    robot = Robot(faults=WheelFaults(takes_body_speeds))
+    robot.drive(4.0, (3.0, 3.0))
+    move = robot._move
+    # It turns by half more than is commanded.
+    mean, difference = 0.5 * (0.6 + 3.5), 0.5 * (3.5 - 0.6)
+    turned = (mean - 1.5 * difference, mean + 1.5 * difference)
+    robot._move = lambda _commanded, turns, counts: move(turned, turns, counts)
+    assert (robot.drive(2.0, (0.6, 3.5)) is None) is takes_body_speeds
 
 
 @pytest.mark.parametrize("speed", [SLOW, FAST])

@@ -44,36 +44,19 @@ class MinimalHost:
             return []
         frames = []
         if now_ms % 500 == 1:
-            frames.append(
-                self._encode(
-                    "HELLO_REQUEST",
-                    protocol_major=PROTOCOL_MAJOR,
-                    protocol_minor=PROTOCOL_MINOR,
-                    dbc_hash=self.codec.dbc_hash,
-                )
-            )
+            handshake = {"protocol_major": PROTOCOL_MAJOR, "protocol_minor": PROTOCOL_MINOR}
+            frames.append(self._encode("HELLO_REQUEST", **handshake, dbc_hash=self.codec.dbc_hash))
         if now_ms % 1000 == 7:
             frames.append(self._encode("TIME_REQUEST", sequence=now_ms // 1000 % 256))
         if now_ms % (50 * self._patience) == 3:
             challenge = int(self.latest.get("SESSION_STATE", {}).get("challenge", 0))
             response = binascii.crc_hqx(struct.pack("<HBI", challenge, self.session, self.codec.dbc_hash), 0xFFFF)
-            frames.append(
-                self._encode(
-                    "HOST_STATE", request=self.request, session=self.session, challenge_answer=response, host_fault=0
-                )
-            )
+            state = {"request": self.request, "session": self.session, "challenge_answer": response}
+            frames.append(self._encode("HOST_STATE", **state, host_fault=0))
         if now_ms % (20 * self._patience) == 5 and self.request == "ARM":
             left, right = self.speeds if self.robot_state == "ARMED" else (0.0, 0.0)
-            frames.append(
-                self._encode(
-                    "WHEEL_COMMAND",
-                    mode=self.mode,
-                    left_speed=left,
-                    right_speed=right,
-                    valid_for=0.1 * self._patience,
-                    session=self.session,
-                )
-            )
+            command = {"mode": self.mode, "left_speed": left, "right_speed": right, "valid_for": 0.1 * self._patience}
+            frames.append(self._encode("WHEEL_COMMAND", **command, session=self.session))
         return frames
 
     def _encode(self, name, **signals):

@@ -14,10 +14,10 @@ R, A, X_ICR = 0.061, 0.415, 0.238
 NEVER_US = 2**62
 
 
-def roll(left_rad_s, right_rad_s, seconds, start=None, slip=(0.0, 0.0, 0.0), parameters=None, **effects):
+def roll(left_rad_s, right_rad_s, seconds, start=None, slip=(0.0, 0.0, 0.0), **effects):
     """Turn the wheels at constant speeds for whole milliseconds; return the body and its path, shape (n, 3)."""
     count = round(seconds * 1000)
-    body = Body(parameters or PlantParameters(), hidden_effects(effects), start or BodyPose())
+    body = Body(PlantParameters(), hidden_effects(effects), start or BodyPose())
     times = np.arange(1, count + 1) * 1000
     angles = np.stack([times * 1e-6 * left_rad_s, times * 1e-6 * right_rad_s], axis=1)
     disturbance = np.tile(slip, (count, 1))
@@ -71,21 +71,29 @@ def test_a_step_may_be_of_any_length_without_changing_the_path():
         assert getattr(coarse.pose, name) == pytest.approx(getattr(fine.pose, name), abs=1e-9)
 
 
-def yaw_rate(left, right, **effects):
-    return roll(left, right, 0.2, **effects)[0].velocity[2]
+TURNING_RAD_S = R * 6.0 / A
+"""Yaw rate of wheels that turn at 3 rad/s against each other."""
 
 
-def test_turn_slip_takes_a_share_that_grows_with_the_rate_in_both_directions():
-    nominal = yaw_rate(-3.0, 3.0)
-    assert yaw_rate(-3.0, 3.0, turn_slip=0.1) == pytest.approx(nominal * (1.0 - 0.1 * nominal))
-    assert yaw_rate(3.0, -3.0, turn_slip=0.1) == pytest.approx(-nominal * (1.0 - 0.1 * nominal))
-    assert yaw_rate(-3.0, 3.0, turn_slip=10.0) == pytest.approx(0.5 * nominal)
-
-
-def test_saturating_turn_slip_levels_off():
-    nominal = yaw_rate(-3.0, 3.0)
-    expected = nominal * (1.0 - 0.2 * nominal / (1.0 + nominal / 0.4))
-    assert yaw_rate(-3.0, 3.0, x_saturating_turn_slip=0.2) == pytest.approx(expected)
+@pytest.mark.parametrize(
+    ("place", "effects", "yaw_rate_rad_s"),
+    [
+        ((0.0, 0.0), {"turn_slip": 0.1}, TURNING_RAD_S * (1.0 - 0.1 * TURNING_RAD_S)),
+        ((0.0, 0.0), {"turn_slip": 10.0}, 0.5 * TURNING_RAD_S),
+        (
+            (0.0, 0.0),
+            {"x_saturating_turn_slip": 0.2},
+            TURNING_RAD_S * (1.0 - 0.2 * TURNING_RAD_S / (1.0 + TURNING_RAD_S / 0.4)),
+        ),
+        ((0.5, 0.1), {"x_carpet_patch": 0.2}, TURNING_RAD_S / 1.2),
+        ((3.0, 0.0), {"x_carpet_patch": 0.2}, TURNING_RAD_S),
+    ],
+    ids=["slip", "most slip", "saturating slip", "on the carpet", "off the carpet"],
+)
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_turn_on_the_spot_is_slowed_alike_in_both_directions(place, effects, yaw_rate_rad_s, sign):
+    body, _ = roll(-3.0 * sign, 3.0 * sign, 0.2, start=BodyPose(*place, 0.0), **effects)
+    assert body.velocity[2] == pytest.approx(sign * yaw_rate_rad_s)
 
 
 def test_a_larger_right_wheel_turns_the_robot_left():
@@ -129,10 +137,11 @@ def accelerate(sign, **effects):
     angle = np.where(t < 1.0, 3.0 * t**2, 3.0 + 6.0 * (t - 1.0) - 3.0 * (t - 1.0) ** 2) * sign
     body = Body(PlantParameters(), hidden_effects(effects), BodyPose())
     pieces = WheelPieces(times, np.stack([angle, angle], axis=1))
-    body.advance(pieces, 0, 1000, NEVER_US, np.zeros((2000, 3)), 0, 1000)
-    first = body.pose.x_m
-    body.advance(pieces, 1000, 2000, NEVER_US, np.zeros((2000, 3)), 0, 1000)
-    return first, body.pose.x_m - first
+    travelled = []
+    for first in (0, 1000):
+        body.advance(pieces, first, first + 1000, NEVER_US, np.zeros((2000, 3)), 0, 1000)
+        travelled.append(body.pose.x_m - sum(travelled))
+    return travelled
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -157,14 +166,6 @@ def test_wheel_ripple_repeats_once_a_turn_and_averages_out():
     assert speed.min() == pytest.approx(2 * math.pi * R * 0.97, rel=1e-4)
     np.testing.assert_allclose(speed[:999], speed[1000:], rtol=1e-6)
     assert path[-1, 0] == pytest.approx(2 * math.pi * R * seconds, rel=1e-4)
-
-
-def test_the_carpet_slows_turns_on_its_disc_only():
-    nominal = yaw_rate(-3.0, 3.0)
-    on = roll(-3.0, 3.0, 0.2, start=BodyPose(0.5, 0.1, 0.0), x_carpet_patch=0.2)[0]
-    off = roll(-3.0, 3.0, 0.2, start=BodyPose(3.0, 0.0, 0.0), x_carpet_patch=0.2)[0]
-    assert on.velocity[2] == pytest.approx(nominal / 1.2)
-    assert off.velocity[2] == pytest.approx(nominal)
 
 
 def test_slip_disturbance_moves_a_driving_body_and_not_a_resting_one():

@@ -17,30 +17,22 @@ def fail_transmission(node, times, acknowledged=True):
     return [report for report in reports if report is not None]
 
 
-def sent_ids(node):
-    ids = []
+def sent(node):
+    """Send all frames that are queued; return them."""
+    frames = []
     while node.queue:
-        ids.append(node.start().can_id)
+        frames.append(node.start())
         node.count_sent()
-    return ids
+    return frames
 
 
-def test_priority_sends_the_lowest_identifier_first_and_equals_in_order(node):
-    for sequence, (can_id, data) in enumerate([(0x200, b"1"), (0x100, b"2"), (0x300, b"3"), (0x100, b"4")]):
-        assert node.push(sequence, CanFrame(can_id, data))
-    first, second = node.start(), None
-    node.count_sent()
-    second = node.start()
-    node.count_sent()
-    assert (first, second) == (CanFrame(0x100, b"2"), CanFrame(0x100, b"4"))
-    assert sent_ids(node) == [0x200, 0x300]
-
-
-def test_fifo_sends_in_order():
-    node = BusNode("a", capacity=4, order=TransmitOrder.FIFO, echo=False)
-    for sequence, can_id in enumerate([0x200, 0x100, 0x300]):
-        node.push(sequence, CanFrame(can_id))
-    assert sent_ids(node) == [0x200, 0x100, 0x300]
+@pytest.mark.parametrize(("order", "places"), [(TransmitOrder.PRIORITY, (1, 3, 0, 2)), (TransmitOrder.FIFO, range(4))])
+def test_priority_sends_the_lowest_identifier_first_and_equals_in_order_and_fifo_all_in_order(order, places):
+    node = BusNode("a", capacity=4, order=order, echo=False)
+    frames = [CanFrame(0x200, b"1"), CanFrame(0x100, b"2"), CanFrame(0x300, b"3"), CanFrame(0x100, b"4")]
+    for sequence, frame in enumerate(frames):
+        assert node.push(sequence, frame)
+    assert sent(node) == [frames[place] for place in places]
 
 
 def test_a_full_queue_refuses_and_counts_including_the_frame_on_the_wire(node):
@@ -63,23 +55,16 @@ def test_a_destroyed_frame_keeps_its_place(node):
     assert node.start().data == b"first"
 
 
-def test_transmit_errors_lead_over_warning_and_passive_to_bus_off(node):
+def test_transmit_errors_lead_over_warning_and_passive_to_bus_off_and_each_change_is_an_error_frame_of_socketcan(node):
     node.push(1, CanFrame(5))
-    states = []
+    states, reports = [], []
     for _ in range(32):
-        fail_transmission(node, 1)
+        reports += fail_transmission(node, 1)
         states.append(node.state)
     assert states.index(ErrorState.WARNING) == 96 // 8 - 1
     assert states.index(ErrorState.PASSIVE) == 128 // 8 - 1
     assert states.index(ErrorState.BUS_OFF) == 256 // 8 - 1
-    assert node.bus_off_count == 1
-    assert node.pending == 0
-    assert node.lost_by_bus_off == 1
-
-
-def test_changes_of_state_are_reported_as_socketcan_error_frames(node):
-    node.push(1, CanFrame(5))
-    reports = fail_transmission(node, 32)
+    assert (node.bus_off_count, node.pending, node.lost_by_bus_off) == (1, 0, 1)
     assert [(report.can_id, report.data[1], report.data[6]) for report in reports] == [
         (0x204, 0x08, 96),
         (0x204, 0x20, 128),
@@ -107,8 +92,7 @@ def test_bus_off_during_a_frame_stays_bus_off_whatever_becomes_of_the_frame(node
 def test_recovery_clears_the_counters(node):
     node.rec = 40
     node.force_bus_off()
-    report = node.recover()
-    assert report.can_id == 0x100
+    assert node.recover().can_id == 0x100
     assert (node.tec, node.rec, node.state) == (0, 0, ErrorState.ACTIVE)
 
 

@@ -44,22 +44,16 @@ def test_bytes_are_those_of_socketcan(frame):
     assert unpack_frame(packed) == frame
 
 
-@pytest.mark.parametrize(
-    "create_frame", [bus_off_frame, receive_overflow_frame, lambda: controller_error_frame(130, 7, 0x20)]
-)
-def test_error_frames_survive_the_bytes(create_frame):
-    frame = create_frame()
+@pytest.mark.parametrize("frame", [bus_off_frame(), receive_overflow_frame(), controller_error_frame(300, 7, 0x20)])
+def test_error_frames_survive_the_bytes(frame):
     can_id, length, _, data = dissect_can_frame(pack_frame(frame))
-    assert can_id == 0x20000000 | frame.can_id
-    assert length == 8
-    assert data == frame.data
+    assert (can_id, length, data) == (0x20000000 | frame.can_id, 8, frame.data)
     assert unpack_frame(pack_frame(frame)) == frame
 
 
 def test_controller_error_frame_carries_the_counters():
     frame = controller_error_frame(300, 7, 0x20)
-    assert frame.can_id == 0x204
-    assert frame.data == bytes((0, 0x20, 0, 0, 0, 0, 255, 7))
+    assert (frame.can_id, frame.data) == (0x204, bytes((0, 0x20, 0, 0, 0, 0, 255, 7)))
 
 
 @examples(quick=40, every=100, packet=st.binary(max_size=40))
@@ -156,11 +150,6 @@ def test_length_equals_that_of_a_bit_by_bit_frame(frame):
     wire = stuff(fields(frame))
     assert stuffed_bits(frame) == "".join(map(str, wire))
     assert frame_bits(frame) == len(wire) + 1 + 2 + 7 + 3
-
-
-@examples(quick=40, every=100, data=st.binary(min_size=8, max_size=8), can_id=st.integers(0, 0x7FF))
-def test_standard_frame_of_eight_bytes_takes_111_to_135_bits(data, can_id):
-    assert 111 <= frame_bits(CanFrame(can_id, data)) <= 135
 
 
 @given(st.integers(0, 8), st.booleans(), st.data())

@@ -87,12 +87,9 @@ def test_impossible_values_are_refused_in_one_line(text, expected_error):
     assert "\n" not in str(caught.value)
 
 
-def test_no_value_at_all_is_refused():
+def test_an_effect_without_a_value_and_one_given_twice_are_refused():
     with pytest.raises(HiddenEffectError, match="0 values"):
         hidden_effects({"turn_slip": ()})
-
-
-def test_the_same_effect_twice_is_refused():
     with pytest.raises(HiddenEffectError, match="twice"):
         parse_hidden_effects(["turn_slip=0.1", "turn_slip=0.2"])
 

@@ -27,13 +27,9 @@ def test_a_sound_encoder_leaves_the_wanted_speeds_as_they_are(use):
 
 
 @pytest.mark.parametrize("reports", [lambda true: 0.0, lambda true: -true], ids=["frozen", "reversed"])
-def test_a_speed_loop_runs_to_full_speed_with_a_wrong_encoder_and_the_other_side_is_left_alone(reports):
+def test_a_wrong_encoder_makes_a_speed_loop_run_away_and_locks_a_commutated_motor(reports):
     assert driven(EncoderUse.SPEED, reports, 0.3)[0] > 1.5
     assert driven(EncoderUse.SPEED, reports, 5.0) == (FULL_RAD_S, 1.0)
-
-
-@pytest.mark.parametrize("reports", [lambda true: 0.0, lambda true: -true], ids=["frozen", "reversed"])
-def test_a_motor_that_is_commutated_by_a_wrong_encoder_locks(reports):
     assert driven(EncoderUse.COMMUTATION, reports, 1.0) == (0.0, 1.0)
 
 

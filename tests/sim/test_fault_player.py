@@ -1,7 +1,6 @@
 """A schedule carried out: on the robot, on a simulated bus and on a serial line."""
 
 import os
-import time
 
 import pytest
 
@@ -16,6 +15,7 @@ from sim.plant import Plant
 from sim.serial_line import SerialLine
 from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS, VirtualRobot
+from tests.drivers.waiting import wait_until
 from tools.faults.in_process import SimulatedCan
 
 MS = 1_000_000
@@ -83,37 +83,20 @@ def test_the_clock_jumps_but_never_before_its_beginning(step_s):
     assert rig.robot.device_us(101_000) == 10_000_000
 
 
-def test_button_and_babble_are_taken_back():
-    rig = Rig('kind="estop_button"\nat_s=0.1\nfor_s=0.1', 'kind="babble"\nat_s=0.1\nfor_s=0.1\nid=0x7ff\nrate_hz=500')
-    rig.run(150)
-    assert rig.robot.estop_button
-    assert 0x7FF in rig.received_ids
-    rig.run(205)
-    rig.received_ids.clear()
-    rig.run(300)
-    assert not rig.robot.estop_button
-    assert 0x7FF not in rig.received_ids
-
-
-def test_of_two_faults_of_a_kind_at_once_the_end_of_one_leaves_the_other():
+def test_button_and_babble_are_taken_back_and_of_two_of_a_kind_at_once_the_end_of_one_leaves_the_other():
     rig = Rig(
         'kind="estop_button"\nat_s=0.05\nfor_s=0.3',
         'kind="estop_button"\nat_s=0.1\nfor_s=0.05',
         'kind="babble"\nat_s=0.05\nfor_s=0.3\nid=0x7fe\nrate_hz=500',
         'kind="babble"\nat_s=0.1\nfor_s=0.05\nid=0x7ff\nrate_hz=500',
     )
-    rig.run(200)
-    assert rig.robot.estop_button
-    rig.received_ids.clear()
-    rig.run(300)
-    assert rig.robot.estop_button
-    assert 0x7FE in rig.received_ids
-    assert 0x7FF not in rig.received_ids
-    rig.run(400)
-    rig.received_ids.clear()
-    rig.run(450)
-    assert not rig.robot.estop_button
-    assert 0x7FE not in rig.received_ids
+    babblers = {0x7FE, 0x7FF}
+    for until_ms, is_pressed, babbling in ((140, True, babblers), (300, True, {0x7FE}), (450, False, set())):
+        rig.run(until_ms - 50)
+        rig.received_ids.clear()
+        rig.run(until_ms)
+        assert rig.robot.estop_button == is_pressed
+        assert babblers & set(rig.received_ids) == babbling
 
 
 @pytest.mark.parametrize("second", ["unplug", "unplug_mid_frame"])
@@ -184,7 +167,8 @@ def injection(robot, link):
     return Injection(robot, link)
 
 
-def babbled(injection, link, until_ms):
+def stepped(injection, link, until_ms):
+    """Let time pass; return the frames that came."""
     frames = []
     for now_ms in range(1, until_ms + 1):
         frames += link.advance(now_ms * MS)
@@ -194,11 +178,15 @@ def babbled(injection, link, until_ms):
 
 def test_estop_button(robot, injection):
     assert injection.execute("estop_button on", 0) == "ok"
-    for step in range(1, 4):
-        robot.step(step * 1000)
+    step_robot(robot, 1, 4)
     assert robot.outputs.state == "ESTOP"
     assert injection.execute("estop_button off", 0) == "ok"
     assert not robot.estop_button
+
+
+def step_robot(robot, *range_ms):
+    for ms in range(*range_ms):
+        robot.step(ms * 1000)
 
 
 def test_kidnap(robot, injection):
@@ -207,18 +195,15 @@ def test_kidnap(robot, injection):
     assert (truth.x_m, truth.y_m, truth.yaw_rad) == pytest.approx((0.5, -1.0, 0.25))
 
 
-def test_bus_off_of_the_robot(link, injection):
-    assert injection.execute("bus_off robot", 0) == "ok"
-    assert link.robot.node.state is ErrorState.BUS_OFF
-
-
-def test_bus_off_is_the_hosts_by_default(link, injection):
+def test_bus_off_is_the_hosts_by_default_or_the_robots(link, injection):
     with UnixCanBus(str(link.path)) as bus:
         link.collect(0)
         assert injection.execute("bus_off", 0) == "ok"
         link.advance(0)
         assert bus.recv(1).arbitration_id == 0x40
     assert link.robot.node.state is ErrorState.ACTIVE
+    assert injection.execute("bus_off robot", 0) == "ok"
+    assert link.robot.node.state is ErrorState.BUS_OFF
 
 
 def test_unplug_lasts_as_long_as_asked(tmp_path, link, injection):
@@ -231,7 +216,7 @@ def test_unplug_lasts_as_long_as_asked(tmp_path, link, injection):
 
 def test_babble_at_its_rate_until_asked_to_stop(link, injection):
     assert injection.execute("babble 0x100 200", 0) == "ok"
-    frames = babbled(injection, link, 1000)
+    frames = stepped(injection, link, 1000)
     assert len(frames) == pytest.approx(200, abs=2)
     assert {received.frame for received in frames} == {Frame(0x100, bytes(8))}
     assert injection.execute("babble 256 0", 1000 * MS) == "ok"
@@ -242,21 +227,19 @@ def test_babble_at_its_rate_until_asked_to_stop(link, injection):
 
 def test_babble_beyond_the_bit_rate_fills_the_bus_and_no_more(link, injection):
     assert injection.execute("babble 0x001 50000", 0) == "ok"
-    frames = babbled(injection, link, 100)
+    frames = stepped(injection, link, 100)
     assert 0.1 * 500_000 / 135 - 35 < len(frames) < 0.1 * 500_000 / 100
 
 
 def test_reboot(robot, injection):
-    for step in range(1, 100):
-        robot.step(step * 1000)
+    step_robot(robot, 1, 100)
     assert injection.execute("reboot watchdog", 0) == "ok"
-    robot.step(100_000)
+    step_robot(robot, 100, 101)
     assert robot.outputs.state in {"BOOT", "FAULT"}
-    robot.step(101_000)
+    step_robot(robot, 101, 102)
     assert robot.outputs.fault != 0
     assert injection.execute("reboot", 0) == "ok"
-    for step in range(102, 200):
-        robot.step(step * 1000)
+    step_robot(robot, 102, 200)
     assert robot.outputs.fault == 0
 
 
@@ -296,7 +279,7 @@ def test_a_bad_command_is_refused_with_one_line_and_changes_nothing(robot, link,
     assert "\n" not in response
     assert robot.plant.truth == before
     assert link.path.exists()
-    assert babbled(injection, link, 5) == []
+    assert stepped(injection, link, 5) == []
 
 
 def test_what_a_link_cannot_do_is_refused(robot):
@@ -314,40 +297,36 @@ def test_every_command_is_described(injection):
     assert named == [line.split()[0] for line in COMMANDS.splitlines()]
 
 
-def test_hogs_run_while_the_fault_lasts_and_not_beyond_the_block():
-    faults = parse_schedule('[[fault]]\nkind="cpu_hog"\nat_s=0\nfor_s=1\ncores=2').faults
+def fault_of(kind, **values):
+    fields = "".join(f"\n{name}={value}" for name, value in values.items())
+    return parse_schedule(f'[[fault]]\nkind="{kind}"\nat_s=0\nfor_s=1{fields}').faults[0]
+
+
+def test_hogs_run_while_their_fault_lasts_no_other_and_not_beyond_the_block():
+    fault = fault_of("cpu_hog", cores=2)
     with CpuHogs() as hogs:
-        hogs.begin(faults[0])
-        running = hogs._busy[faults[0].number]
+        hogs.begin(fault)
+        running = hogs._busy[fault.number]
         assert [process.poll() for process in running] == [None, None]
-        hogs.end(faults[0])
+        hogs.end(fault)
         assert all(process.poll() is not None for process in running)
-        hogs.begin(faults[0])
-        running = hogs._busy[faults[0].number]
+        hogs.begin(fault_of("sigstop"))
+        hogs.end(fault_of("sigstop"))
+        assert hogs._busy == {}
+        hogs.begin(fault)
+        running = hogs._busy[fault.number]
     assert all(process.poll() is not None for process in running)
 
 
-def test_other_faults_are_not_for_it():
-    (fault,) = parse_schedule('[[fault]]\nkind="sigstop"\nat_s=0\nfor_s=1').faults
-    with CpuHogs() as hogs:
-        hogs.begin(fault)
-        hogs.end(fault)
-        assert hogs._busy == {}
-
-
-def test_they_are_no_real_time_processes_though_their_parent_is():
-    (fault,) = parse_schedule('[[fault]]\nkind="cpu_hog"\nat_s=0\nfor_s=1\ncores=1').faults
+def test_hogs_are_no_real_time_processes_though_their_parent_is():
     with CpuHogs() as hogs:
         try:
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
         except PermissionError:
             pytest.skip("no real-time scheduling allowed here")
         try:
-            hogs.begin(fault)
+            hogs.begin(fault_of("cpu_hog", cores=1))
         finally:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         pid = hogs._busy[1][0].pid
-        deadline = time.monotonic() + 60.0
-        while os.sched_getscheduler(pid) != os.SCHED_OTHER:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_until(lambda: os.sched_getscheduler(pid) == os.SCHED_OTHER, 60.0)

@@ -41,12 +41,12 @@ def can():
     return can
 
 
-def outgoing(deadline_ms=1000):
-    return OutgoingFrame(FRAME, deadline_ms * MS)
+def send(can, deadline_ms=1000):
+    return can.host.send(OutgoingFrame(FRAME, deadline_ms * MS), 0)
 
 
 def test_frames_take_their_time_both_ways(can):
-    assert can.host.send(outgoing(), 0)
+    assert send(can)
     can.send([Frame(0x110, b"\x01")])
     assert can.advance(100_000) == []
     (received,) = can.advance(1 * MS)
@@ -60,9 +60,8 @@ def test_frames_take_their_time_both_ways(can):
 
 
 def test_what_is_late_or_does_not_fit_is_counted(can):
-    assert not can.host.send(outgoing(deadline_ms=-1), 0)
-    results = [can.host.send(outgoing(), 0) for _ in range(40)]
-    assert results == [True] * 32 + [False] * 8
+    assert not send(can, deadline_ms=-1)
+    assert [send(can) for _ in range(40)] == [True] * 32 + [False] * 8
     assert (can.host.stats.expired, can.host.stats.transmit_queue_full) == (1, 8)
 
 
@@ -71,7 +70,7 @@ def test_unplugged_the_link_is_down_and_comes_back_as_another(can):
     can.unplug(50 * MS)
     assert can.host.state is LinkState.CONNECTING
     assert can.host.last_error == "unplugged"
-    assert not can.host.send(outgoing(), 0)
+    assert not send(can)
     can.advance(49 * MS)
     assert can.host.state is LinkState.CONNECTING
     can.advance(50 * MS)

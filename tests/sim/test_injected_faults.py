@@ -68,9 +68,8 @@ def test_a_reversed_encoder_counts_down_without_a_jump_and_up_again():
 def test_a_jump_stays():
     faults = RobotFaults()
     faults.set_active([], [fault("encoder_jump", wheel="right", ticks=5000)])
-    assert seen(faults, 0).right_ticks == 6000
-    assert seen(faults, 0).right_ticks == 6000
-    assert seen(faults, 0).left_ticks == 0
+    for _ in range(2):
+        assert (seen(faults, 0).left_ticks, seen(faults, 0).right_ticks) == (0, 6000)
 
 
 def test_a_short_counter_wraps():
@@ -140,8 +139,7 @@ def test_late_poses_keep_their_stamps_and_their_order_and_none_is_lost():
 
 
 def test_a_silent_sensor_says_nothing():
-    faults = under("pose_silent")
-    assert faults.poses(0, [pose(0)]) == []
+    assert under("pose_silent").poses(0, [pose(0)]) == []
 
 
 MS = 1_000_000
@@ -170,9 +168,9 @@ def test_the_timeline_reports_each_beginning_and_end_once():
     assert (names(begun), names(ended)) == (["unplug"], ["unplug"])
 
 
-def outcomes_of(text, count=400, sender="host", frame=FRAME, seed=1):
+def outcomes_of(kind, *fields, count=400, sender="host", frame=FRAME, seed=1):
     faults = FrameFaults(seed)
-    faults.set_active(schedule(text).faults)
+    faults.set_active(schedule("\n".join((f'kind="{kind}"\nat_s=0\nfor_s=1', *fields))).faults)
     return faults, [faults.outcome(k, sender, frame) for k in range(count)]
 
 
@@ -192,7 +190,7 @@ def outcomes_of(text, count=400, sender="host", frame=FRAME, seed=1):
     ],
 )
 def test_each_kind_touches_its_share_of_the_frames(kind, touched):
-    faults, found = outcomes_of(f'kind="{kind}"\nat_s=0\nfor_s=1\nprobability=0.3')
+    faults, found = outcomes_of(kind, "probability=0.3")
     count = sum(map(touched, found))
     assert 80 < count < 160
     assert faults.struck == {1: count}
@@ -205,9 +203,8 @@ def one_bit_differs(data):
 
 
 def test_the_same_seed_strikes_the_same_frames_and_another_others():
-    text = 'kind="drop"\nat_s=0\nfor_s=1'
-    assert outcomes_of(text, seed=1)[1] == outcomes_of(text, seed=1)[1]
-    assert outcomes_of(text, seed=1)[1] != outcomes_of(text, seed=2)[1]
+    first, again, other = (outcomes_of("drop", seed=seed)[1] for seed in (1, 1, 2))
+    assert first == again != other
 
 
 @pytest.mark.parametrize(
@@ -224,26 +221,23 @@ def test_the_same_seed_strikes_the_same_frames_and_another_others():
     ],
 )
 def test_direction_and_identifier_choose(text, sender, struck):
-    faults, _ = outcomes_of(f'kind="drop"\nat_s=0\nfor_s=1\nprobability=1.0\n{text}', count=1, sender=sender)
+    faults, _ = outcomes_of("drop", "probability=1.0", text, count=1, sender=sender)
     assert bool(faults.struck) == struck
 
 
 def test_one_way_takes_all_of_one_direction():
-    _, found = outcomes_of('kind="one_way"\nat_s=0\nfor_s=1\nto="host"', sender="robot", count=20)
-    assert all(outcome.lost for outcome in found)
-    _, found = outcomes_of('kind="one_way"\nat_s=0\nfor_s=1\nto="host"', sender="host", count=20)
-    assert not any(outcome.lost or outcome.lost_at for outcome in found)
+    to_host, to_robot = (outcomes_of("one_way", 'to="host"', sender=name, count=20)[1] for name in ("robot", "host"))
+    assert all(outcome.lost for outcome in to_host)
+    assert not any(outcome.lost or outcome.lost_at for outcome in to_robot)
 
 
 def test_a_longer_frame_than_its_data_is_padded_to_a_wrong_length():
-    _, found = outcomes_of('kind="wrong_length"\nat_s=0\nfor_s=1\nprobability=1.0', frame=CanFrame(0x80, b"\x01"))
+    _, found = outcomes_of("wrong_length", "probability=1.0", frame=CanFrame(0x80, b"\x01"))
     assert {len(outcome.data) for outcome in found} == {0, 2, 3, 4, 5, 6, 7, 8}
 
 
 def test_an_empty_frame_has_no_bit_to_flip():
-    _, found = outcomes_of(
-        'kind="flip_after_crc"\nat_s=0\nfor_s=1\nprobability=1.0', frame=CanFrame(0x80, b""), count=5
-    )
+    _, found = outcomes_of("flip_after_crc", "probability=1.0", frame=CanFrame(0x80, b""), count=5)
     assert all(outcome.data is None for outcome in found)
 
 

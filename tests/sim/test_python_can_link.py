@@ -33,23 +33,14 @@ def link():
     link.close()
 
 
-def test_frames_pass_both_ways(link, bus):
-    link.send([FRAME])
-    message = bus.recv(30)
-    assert (message.arbitration_id, bytes(message.data), message.is_extended_id) == (0x100, FRAME.data, False)
-    bus.send(message)
-    assert link.collect(7) == 1
-    assert [(r.t_ns, r.frame) for r in link.advance(7)] == [(7, FRAME)]
-
-
-def test_frames_with_long_identifiers_pass_both_ways(link, bus):
-    frame = Frame(0x317, b"\x01", extended=True)
+@pytest.mark.parametrize("frame", [FRAME, Frame(0x317, b"\x01", extended=True)], ids=["short identifier", "long"])
+def test_frames_pass_both_ways(link, bus, frame):
     link.send([frame])
     message = bus.recv(30)
-    assert (message.arbitration_id, message.is_extended_id) == (0x317, True)
+    assert Frame(message.arbitration_id, bytes(message.data), message.is_extended_id) == frame
     bus.send(message)
     assert link.collect(7) == 1
-    assert [r.frame for r in link.advance(7)] == [frame]
+    assert [(r.t_ns, r.frame) for r in link.advance(7)] == [(7, frame)]
 
 
 def test_waiting_frames_can_be_let_in_a_few_at_a_time(link, bus):
@@ -62,8 +53,8 @@ def test_waiting_frames_can_be_let_in_a_few_at_a_time(link, bus):
 
 
 def test_frames_that_are_not_for_robots_are_counted_and_left_out(link, bus):
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False, is_remote_frame=True))
-    bus.send(can.Message(arbitration_id=1, is_extended_id=False, is_error_frame=True))
+    for kind in ("is_remote_frame", "is_error_frame"):
+        bus.send(can.Message(arbitration_id=1, is_extended_id=False, **{kind: True}))
     assert link.collect(1) == 0
     assert link.ignored == 2
 

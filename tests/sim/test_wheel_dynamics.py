@@ -12,6 +12,8 @@ from sim.wheel_dynamics import WheelMotors
 
 NOISELESS = PlantParameters().noiseless()
 IDEAL = NOISELESS.with_ideal_motors()
+UNLOADED = replace(NOISELESS, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf)
+
 NO_DISTURBANCE = np.zeros((100_000, 2))
 
 
@@ -41,21 +43,18 @@ def test_ideal_wheels_turn_exactly_as_commanded():
 
 
 def test_the_unloaded_response_is_a_first_order_lag_with_the_stated_time_constant():
-    bench = Bench(replace(NOISELESS, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf))
-    speeds = bench.run(0.3, 3.0, 3.0)[:, 0]
+    speeds = Bench(UNLOADED).run(0.3, 3.0, 3.0)[:, 0]
     t = np.arange(1, 301) * 1e-3
     np.testing.assert_allclose(speeds, 3.0 * (1.0 - np.exp(-t / 0.06)), atol=1e-9)
 
 
-def test_motor_lag_takes_the_place_of_the_loops_own_time_constant():
-    for parameters in (IDEAL, replace(NOISELESS, turning_load_nm=0.0, max_motor_acceleration_rad_s2=math.inf)):
-        bench = Bench(parameters, motor_lag=0.12)
-        assert bench.run(0.12, 3.0, 3.0)[-1, 0] == pytest.approx(3.0 * (1.0 - math.exp(-1.0)), abs=1e-9)
-
-
-def test_the_lagged_angle_is_the_integral_of_the_lagged_speed():
-    bench = Bench(IDEAL, motor_lag=0.12)
-    bench.run(1.0, 3.0, 3.0)
+@pytest.mark.parametrize("parameters", [IDEAL, UNLOADED], ids=["ideal motors", "unloaded"])
+def test_motor_lag_takes_the_place_of_the_loops_own_time_constant_and_the_angle_is_the_integral_of_the_speed(
+    parameters,
+):
+    bench = Bench(parameters, motor_lag=0.12)
+    assert bench.run(0.12, 3.0, 3.0)[-1, 0] == pytest.approx(3.0 * (1.0 - math.exp(-1.0)), abs=1e-9)
+    bench.run(0.88, 3.0, 3.0)
     assert bench.angles[0] == pytest.approx(3.0 * (1.0 - 0.12 * (1.0 - math.exp(-1.0 / 0.12))), abs=1e-5)
 
 
@@ -90,10 +89,11 @@ def test_the_loop_works_off_the_load_of_turning():
     assert bench.wheels.torques_nm[1] == pytest.approx(0.15 + 3 * 0.02 + 0.25, abs=0.01)
 
 
-def test_a_wheel_that_is_commanded_to_stop_stands_still():
+def test_a_wheel_that_is_commanded_to_stop_stands_still_and_while_it_is_disabled_ignores_its_command():
     bench = Bench(NOISELESS)
     bench.run(0.5, -3.0, 5.0)
     assert np.all(bench.run(1.0, 0.0, 0.0)[-1] == 0.0)
+    assert np.all(bench.run(0.5, 5.0, 5.0, enabled=False) == 0.0)
 
 
 def test_a_wheel_without_drive_coasts_to_rest_on_friction():
@@ -104,11 +104,6 @@ def test_a_wheel_without_drive_coasts_to_rest_on_friction():
     assert np.argmax(speeds[:, 0] == 0.0) == pytest.approx(1000 * seconds_to_rest, abs=3)
     assert np.all(speeds[-1] == 0.0)
     assert bench.wheels.torques_nm == (0.0, 0.0)
-
-
-def test_a_disabled_wheel_at_rest_ignores_its_command():
-    bench = Bench(NOISELESS)
-    assert np.all(bench.run(0.5, 5.0, 5.0, enabled=False) == 0.0)
 
 
 @pytest.mark.parametrize("enabled", [True, False])
@@ -212,13 +207,10 @@ def test_the_second_order_motor_overshoots_as_its_damping_says():
     assert speeds[-1] == pytest.approx(2.0, abs=1e-3)
 
 
-def test_a_motor_of_limited_acceleration_ramps():
+def test_a_motor_of_limited_acceleration_ramps_and_may_stop_at_another_rate():
     speeds = Bench(IDEAL, acceleration_limit=10.0).run(0.5, 3.0, -3.0)
     assert speeds[99] == pytest.approx((1.0, -1.0), abs=1e-9)
     assert speeds[-1] == pytest.approx((3.0, -3.0), abs=1e-12)
-
-
-def test_a_motor_may_stop_faster_than_it_ramps():
     bench = Bench(IDEAL, acceleration_limit=(10.0, 4.0))
     bench.run(0.3, 3.0, -3.0)
     assert bench.run(0.01, 0.0, 0.0)[-1] == pytest.approx((2.5, -2.5), abs=1e-9)

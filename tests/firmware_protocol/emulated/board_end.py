@@ -7,9 +7,14 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import pytest
+
 from drivers.transport import can, serial
 from tests.firmware_protocol.other_end import LinkEnd
-from tools.check.emulated_board import build_board, running_board
+from tools.check.emulated_board import build_board, missing, running_board
+
+EMULATED = (pytest.mark.long, pytest.mark.hil, pytest.mark.skipif(bool(missing()), reason=missing() or "all there"))
+"""Marks of whatever needs the emulator."""
 
 
 class BoardEnd(LinkEnd):

@@ -16,21 +16,16 @@ import pytest
 
 from drivers.transport import serial
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
-from tests.firmware_protocol.emulated.board_end import BoardEnd
+from tests.firmware_protocol.emulated.board_end import EMULATED, BoardEnd
 from tests.firmware_protocol.other_end import LinkEnd
 from tests.firmware_protocol.protocol_host import CODEC, ProtocolHost
 from tests.sim.test_board import SimProcess
 from tests.sim.test_python_can_link import HubProcess, drive_with_another_node
-from tools.check.emulated_board import build_board, missing, run_fast, running_bare_board, running_board
+from tools.check.emulated_board import build_board, run_fast, running_bare_board, running_board
 
 ROOT = Path(__file__).parents[3]
 ARMED = 3
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.hil,
-    pytest.mark.timeout(300),
-    pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
-]
+pytestmark = [*EMULATED, pytest.mark.timeout(300)]
 
 
 @contextlib.contextmanager
@@ -106,17 +101,11 @@ def test_the_emergency_stop_button_stops_the_wheels(host):
 
 
 def test_parameters_that_were_written_outlive_a_restart(host):
-    def request_parameter(**request):
-        host.latest.pop("PARAM_RESPONSE", None)
-        host.send("PARAM_REQUEST", **request)
-        host.wait_for("PARAM_RESPONSE", lambda: "PARAM_RESPONSE" in host.latest)
-        return host.latest["PARAM_RESPONSE"]["value"]
-
-    assert request_parameter(operation="READ", key=4, value=0.0) == 20.0
-    assert request_parameter(operation="WRITE", key=4, value=5.0) == 5.0
+    assert host.request_parameter("READ", key=4) == ("OK", 20.0)
+    assert host.request_parameter("WRITE", key=4, value=5.0) == ("OK", 5.0)
     host.run(0.1)
     host.restart()
-    assert request_parameter(operation="READ", key=4, value=0.0) == 5.0
+    assert host.request_parameter("READ", key=4) == ("OK", 5.0)
 
 
 def test_a_thousand_frames_of_garbage_move_nothing_and_leave_it_sound(host_at_a_terminal):

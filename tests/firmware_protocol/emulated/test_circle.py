@@ -11,16 +11,12 @@ import pytest
 from disco_hw.experiments import Operator, disco_hw_process
 from disco_hw.log.reader import open_log
 from disco_hw.processes import can_use_fifo
+from tests.firmware_protocol.emulated.board_end import EMULATED
 from tests.watched_processors import build_watcher, watched_processors
-from tools.check.emulated_board import build_board, missing, running_board
+from tools.check.emulated_board import build_board, running_board
 from tools.stack import write_robot_file
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.hil,
-    pytest.mark.timeout(700),
-    pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
-]
+pytestmark = [*EMULATED, pytest.mark.timeout(700)]
 RADIUS_M = 0.75
 LAPS = 3.25
 LAP_S = 2 * math.pi * RADIUS_M / 0.2

@@ -3,46 +3,35 @@
 import pytest
 
 from tests.firmware_protocol.conformance import FirmwareConformance
-from tests.firmware_protocol.emulated.board_end import BoardEnd
-from tools.check.emulated_board import missing
+from tests.firmware_protocol.emulated.board_end import EMULATED, BoardEnd
 
-pytestmark = [
-    pytest.mark.long,
-    pytest.mark.hil,
-    pytest.mark.timeout(300),
-    pytest.mark.skipif(bool(missing()), reason=missing() or "all there"),
-]
+pytestmark = [*EMULATED, pytest.mark.timeout(300)]
 
 
-class TestM3(FirmwareConformance):
+class EmulatedConformance(FirmwareConformance):
+    processor = "m3"
+    is_slcan = False
+
     @classmethod
     def create_end(cls, config):
-        return BoardEnd("m3")
+        return BoardEnd(cls.processor, key=cls.key, slcan=cls.is_slcan)
 
 
-class TestM4F(FirmwareConformance):
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m4f")
+class TestM3(EmulatedConformance):
+    pass
 
 
-class TestAuthenticatedM3(FirmwareConformance):
+class TestM4F(EmulatedConformance):
+    processor = "m4f"
+
+
+class TestAuthenticatedM3(TestM3):
     key = bytes(range(16))
 
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m3", key=cls.key)
 
-
-class TestAuthenticatedM4F(FirmwareConformance):
+class TestAuthenticatedM4F(TestM4F):
     key = bytes(range(16))
 
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m4f", key=cls.key)
 
-
-class TestSlcanM4F(FirmwareConformance):
-    @classmethod
-    def create_end(cls, config):
-        return BoardEnd("m4f", slcan=True)
+class TestSlcanM4F(TestM4F):
+    is_slcan = True

@@ -8,6 +8,7 @@ from cryptography.hazmat.primitives.ciphers import algorithms
 from cryptography.hazmat.primitives.cmac import CMAC
 
 from firmware_protocol import _firmware
+from firmware_protocol.firmware_core import FirmwareCore
 from firmware_protocol.protection import Prover
 from tests.firmware_protocol.bench import CODEC, CONFIG, Bench
 
@@ -27,14 +28,6 @@ def driving():
     return bench
 
 
-def test_who_holds_the_key_arms_and_drives():
-    bench = driving()
-    bench.set_request("STANDBY")
-    bench.command = None
-    bench.run_until("STANDBY")
-    assert refused(bench) == 0
-
-
 def test_it_says_that_it_wants_proof_and_gives_a_nonce():
     bench = Bench(LOCKED)
     bench.run(250)
@@ -44,10 +37,11 @@ def test_it_says_that_it_wants_proof_and_gives_a_nonce():
     assert len(nonces) == 4, "when it is drawn, and at 10 Hz"
 
 
-def test_without_a_key_nothing_of_it_is_seen():
+def test_without_a_key_nothing_of_it_is_seen_and_no_nonce_is_drawn():
     bench = Bench.driving()
     assert int(bench.messages("HELLO")[0].values["capabilities"]) == CONFIG.capabilities
     assert not bench.messages("MAC_CHALLENGE")
+    assert bench.core._core.authentication.draws == 0
     for can_id in (0x0F0, 0x0F1, 0x0F2):
         bench.core.receive(bench.now_us, can_id, bytes(8))
     assert bench.run(50).state == "ARMED"
@@ -67,15 +61,9 @@ def test_without_the_key_not_even_ready(key):
     assert {"HOST_STATE", "ZERO_COMMANDS"} <= bench.blockers()
 
 
-def test_the_emergency_stop_needs_no_key():
+def test_the_emergency_stop_needs_no_key_and_to_leave_it_takes_the_key():
     bench = driving()
-    bench.core.receive(bench.now_us, 0x080, b"")
-    assert bench.step().state == "ESTOP"
-
-
-def test_to_leave_the_emergency_stop_takes_the_key():
-    bench = driving()
-    bench.core.receive(bench.now_us, 0x080, b"")
+    assert bench.estop().state == "ESTOP"
     bench.command = None
     bench.set_request("STANDBY").run(1500)
     proves, bench.prover = bench.prover, None
@@ -90,8 +78,7 @@ def test_an_unproved_standby_neither_stops_nor_takes_a_request_back():
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
     assert bench.set_request("RESET").run(1500).state == "STANDBY"
-    bench.core.receive(bench.now_us, 0x080, b"")
-    bench.step()
+    bench.estop()
     counter = bench.next_counter("HOST_STATE")
     standby = {"request": "STANDBY", "session": 0, "challenge_answer": 0, "host_fault": 0}
     bench.core.receive(bench.now_us, *CODEC.encode("HOST_STATE", counter, **standby))
@@ -119,55 +106,47 @@ def test_a_stranger_who_shouts_neither_steers_nor_stops():
     assert refused(bench) == 300
 
 
-class Recorder:
-    """Between host and robot: everything that the host sends is kept."""
+class RecordingCore(FirmwareCore):
+    """Keeps every frame that its host sends."""
 
-    def __init__(self, bench):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
         self.frames = []
-        core, receive = bench.core, bench.core.receive
-        bench.core = self
-        self._core = core
 
-        def keep(now_us, can_id, data):
-            self.frames.append((can_id, data))
-            receive(now_us, can_id, data)
-
-        self.receive = keep
-
-    def __getattr__(self, name):
-        return getattr(self._core, name)
+    def receive(self, now_us, can_id, data):
+        self.frames.append((can_id, data))
+        super().receive(now_us, can_id, data)
 
 
-def recorded_run(entropy=1):
-    bench = Bench(LOCKED, entropy)
-    recorder = Recorder(bench)
+def recorded_run():
+    """Return a bench that has been brought to drive, and every frame that its host sent on the way."""
+    bench = Bench(LOCKED)
+    bench.core = RecordingCore(LOCKED, 1)
     bench.to_driving()
-    return bench, list(recorder.frames)
+    return bench, list(bench.core.frames)
 
 
-def test_a_recorded_run_played_to_another_start_does_nothing():
-    _, frames = recorded_run(entropy=1)
-    bench = Bench(LOCKED, entropy=2)
+def replay(bench, frames):
+    """Send frames again, one every 5 ms, to a robot that is to stay in STANDBY; return how many more it has refused."""
+    before, accepted = refused(bench), bench.out.accepted_commands
     for can_id, data in frames:
         bench.core.receive(bench.now_us, can_id, data)
         assert bench.run(5).state == "STANDBY"
         assert not bench.out.driver_enabled
-    assert refused(bench) > 20
-    assert bench.out.accepted_commands == 0
+    assert bench.out.accepted_commands == accepted
+    return refused(bench) - before
+
+
+def test_a_recorded_run_played_to_another_start_does_nothing():
+    assert replay(Bench(LOCKED, entropy=2), recorded_run()[1]) > 20
 
 
 def test_a_recorded_run_played_again_later_in_the_same_start_does_nothing():
     bench, frames = recorded_run()
-    bench.set_request("STANDBY")
-    bench.command = None
-    bench.run_until("STANDBY")
+    bench.to_standby()
     bench.request = None
     bench.run(1000)
-    before = refused(bench)
-    for can_id, data in frames:
-        bench.core.receive(bench.now_us, can_id, data)
-        assert bench.run(5).state == "STANDBY"
-    assert refused(bench) > before + 20
+    assert replay(bench, frames) > 20
 
 
 def test_a_frame_played_again_in_its_session_is_refused():
@@ -182,15 +161,14 @@ def test_a_frame_played_again_in_its_session_is_refused():
     assert refused(bench) == 3
 
 
-def test_the_nonce_is_new_in_every_session_and_for_every_host():
+def test_who_holds_the_key_drives_and_the_nonce_is_new_in_every_session_and_for_every_host():
     bench = driving()
     armed = bench.prover._nonce
     bench.hello().run(100)
     assert bench.prover._nonce == armed, "none but the host's own end changes it within a session"
     assert bench.out.state == "ARMED"
-    bench.set_request("STANDBY")
-    bench.command = None
-    bench.run_until("STANDBY")
+    bench.to_standby()
+    assert refused(bench) == 0
     bench.step()
     standby = bench.prover._nonce
     assert standby != armed
@@ -201,7 +179,7 @@ def test_the_nonce_is_new_in_every_session_and_for_every_host():
 
 def test_a_host_that_starts_anew_is_heard():
     bench = Bench.ready(config=LOCKED)
-    bench.set_request("STANDBY").run_until("STANDBY")
+    bench.to_standby()
     bench.run(500)
     bench.prover = Prover(KEY, CODEC)
     bench.run(600)
@@ -215,8 +193,7 @@ def test_parameters_are_read_and_written_with_the_key_alone():
     write = {"operation": "WRITE", "key": 4, "value": 5.0}
     bench.core.receive(bench.now_us, *CODEC.encode("PARAM_REQUEST", 0, **write))
     bench.run(5)
-    assert not bench.messages("PARAM_RESPONSE")
-    assert refused(bench) == 1
+    assert (bench.messages("PARAM_RESPONSE"), refused(bench)) == ([], 1)
     bench.send("PARAM_REQUEST", **write)
     bench.run(5)
     assert [decoded.values["status"] for decoded in bench.messages("PARAM_RESPONSE")] == [0]
@@ -233,11 +210,10 @@ def test_a_proof_of_wrong_length_is_refused(can_id, length):
 def test_damaged_commands_still_count_against_the_sender():
     bench = driving()
     bench.command = None
+    zero = {"mode": "SPEED", "left_speed": 0.0, "right_speed": 0.0, "valid_for": 0.1, "session": 7}
     for counter in range(5):
-        damaged = bytearray(CODEC.encode("WHEEL_COMMAND", counter, mode="SPEED", left_speed=0.0, right_speed=0.0,
-                                         valid_for=0.1, session=7).data)  # fmt: skip
-        damaged[0] ^= 1
-        bench.core.receive(bench.now_us, 0x100, bytes(damaged))
+        can_id, data = CODEC.encode("WHEEL_COMMAND", counter, **zero)
+        bench.core.receive(bench.now_us, can_id, bytes((data[0] ^ 1,)) + data[1:])
     assert bench.step().stop_cause == "E2E_DISQUALIFIED"
     assert (refused(bench), bench.core.rejections["CRC"]) == (0, 5)
 
@@ -265,7 +241,7 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
     a = bench.core._core.authentication
     bench.to_ready()
     draws = a.draws
-    bench.set_request("STANDBY").run_until("STANDBY")
+    bench.to_standby()
     sending = bench.messages("MAC_CHALLENGE", bench.now_us)
     assert sending
     assert (a.prepared, a.draws) == (False, draws)
@@ -273,9 +249,3 @@ def test_the_next_nonce_is_drawn_in_a_cycle_with_nothing_to_send():
     assert (a.prepared, a.draws) == (True, draws + 1)
     bench.run(50)
     assert a.draws == draws + 1
-
-
-def test_without_a_key_no_nonce_is_ever_drawn():
-    bench = Bench().hello()
-    bench.run(100)
-    assert bench.core._core.authentication.draws == 0

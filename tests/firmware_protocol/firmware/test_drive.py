@@ -16,14 +16,8 @@ def setpoints(bench):
 
 
 @pytest.mark.parametrize("state", ["STANDBY", "READY", "FAULT", "ESTOP"])
-def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state, bench):
-    if state == "READY":
-        bench.to_ready()
-    elif state == "FAULT":
-        bench.inputs["left_current_a"] = 99.0
-        bench.run_until("FAULT")
-    elif state == "ESTOP":
-        bench.core.receive(bench.now_us, 0x080, b"")
+def test_driver_is_off_and_brake_on_wherever_the_robot_is_not_armed(state):
+    bench = Bench.in_state(state)
     assert bench.step().state == state
     assert (bench.out.driver_enabled, bench.out.brake, setpoints(bench)) == (False, True, (0.0, 0.0))
 
@@ -57,24 +51,26 @@ def test_speed_is_limited_with_curvature_kept_and_said_so():
     assert bench.out.limited
 
 
-def test_hold_zero_goes_back_to_zero_within_the_limit():
-    bench = Bench.driving()
-    bench.command = {"mode": "HOLD_ZERO"}
+def first_change(bench):
+    """The setpoints of the first cycle in which they are others."""
     before = setpoints(bench)
     while setpoints(bench) == before:
         bench.step()
-    assert setpoints(bench) == pytest.approx((3.98, 1.99))
+    return setpoints(bench)
+
+
+def test_hold_zero_goes_back_to_zero_within_the_limit():
+    bench = Bench.driving()
+    bench.command = {"mode": "HOLD_ZERO"}
+    assert first_change(bench) == pytest.approx((3.98, 1.99))
     bench.run(300)
     assert (setpoints(bench), bench.out.driver_enabled, bench.out.brake) == ((0.0, 0.0), True, False)
 
 
-def test_brake_stops_then_brakes_and_stays_so_when_pushed():
+def test_brake_stops_then_brakes_and_stays_so_when_pushed_or_stopped():
     bench = Bench.driving(config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=40.0))
     bench.command = {"mode": "BRAKE"}
-    before = setpoints(bench)
-    while setpoints(bench) == before:
-        bench.step()
-    assert setpoints(bench)[0] == pytest.approx(3.96)
+    assert first_change(bench)[0] == pytest.approx(3.96)
     assert bench.out.driver_enabled
     bench.run(200)
     assert (bench.out.state, bench.out.driver_enabled, bench.out.brake) == ("ARMED", False, True)
@@ -82,6 +78,7 @@ def test_brake_stops_then_brakes_and_stays_so_when_pushed():
     bench.speeds = [1.0, 1.0]
     bench.run(50)
     assert (bench.out.driver_enabled, bench.out.brake) == (False, True)
+    assert (bench.estop().driver_enabled, bench.out.brake) == (False, True)
 
 
 def test_brake_waits_for_wheels_that_still_roll():
@@ -103,37 +100,31 @@ def coasting():
     return bench
 
 
-def test_coast_lets_go_and_the_driver_takes_over_where_the_wheels_are():
+@pytest.mark.parametrize(
+    ("speeds", "command", "first_setpoints"),
+    [
+        ([3.0, 1.5], {"left": 4.0, "right": 2.0}, (3.02, 1.51)),
+        ([12.0, 6.0], {"mode": "HOLD_ZERO"}, (7.98, 3.99)),
+    ],
+    ids=["rolling", "running away"],
+)
+def test_coast_lets_go_and_the_driver_takes_over_from_the_wheels_within_the_limit(speeds, command, first_setpoints):
     bench = coasting()
     assert (setpoints(bench), bench.out.driver_enabled, bench.out.brake) == ((0.0, 0.0), False, False)
     assert not bench.out.limited
-    bench.speeds = [3.0, 1.5]
-    bench.command = {"left": 4.0, "right": 2.0}
+    bench.speeds, bench.command = speeds, command
     while not bench.step().driver_enabled:
         pass
-    assert setpoints(bench) == pytest.approx((3.02, 1.51))
-
-
-def test_taking_over_a_wheel_that_runs_away_starts_within_the_limit():
-    bench = coasting()
-    bench.speeds = [12.0, 6.0]
-    bench.command = {"mode": "HOLD_ZERO"}
-    while not bench.step().driver_enabled:
-        pass
-    assert setpoints(bench) == pytest.approx((7.98, 3.99))
-
-
-def request_disarm(bench):
-    bench.request["request"] = "STANDBY"
-
-
-def fall_silent(bench):
-    bench.command = None
+    assert setpoints(bench) == pytest.approx(first_setpoints)
 
 
 @pytest.mark.parametrize(
     "act",
-    [lambda bench: bench.core.receive(bench.now_us, 0x080, b""), request_disarm, fall_silent],
+    [
+        lambda bench: bench.core.receive(bench.now_us, 0x080, b""),
+        lambda bench: bench.set_request("STANDBY"),
+        lambda bench: setattr(bench, "command", None),
+    ],
     ids=["estop", "disarmed", "silence"],
 )
 def test_released_wheels_are_braked_by_any_stop_without_a_ramp(act):
@@ -166,7 +157,7 @@ STOPS = {
 
 
 @pytest.mark.parametrize("how", STOPS)
-def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
+def test_estop_decelerates_from_the_very_next_cycle_then_brakes_and_does_not_begin_again(how):
     bench = Bench.driving()
     start = bench.now_us
     trace = stop(bench, STOPS[how])
@@ -175,6 +166,10 @@ def test_estop_decelerates_from_the_very_next_cycle_then_brakes(how):
     assert bench.now_us - start == pytest.approx(200 * MS, abs=3 * MS)
     assert (bench.out.state, bench.out.brake, setpoints(bench)) == ("ESTOP", True, (0.0, 0.0))
     assert not bench.out.limited
+    bench.wheels_follow = False
+    bench.speeds = [2.0, 2.0]
+    for _ in range(100):
+        assert not bench.step().driver_enabled
 
 
 def test_stopping_keeps_curvature_and_ends_in_standby():
@@ -189,7 +184,7 @@ def test_stopping_keeps_curvature_and_ends_in_standby():
     assert (bench.out.driver_enabled, bench.out.brake) == (False, True)
 
 
-def test_silence_drives_no_longer_than_the_drive_off_timeout():
+def test_silence_drives_no_longer_than_the_drive_off_timeout_and_the_next_motion_begins_at_zero():
     bench = Bench.driving(config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0))
     bench.command = None
     bench.wheel_command(4.0, 2.0)
@@ -198,61 +193,30 @@ def test_silence_drives_no_longer_than_the_drive_off_timeout():
         pass
     assert bench.now_us - start == 500 * MS
     assert (bench.out.state, bench.out.brake, setpoints(bench)) == ("STOPPING", True, (0.0, 0.0))
-
-
-def test_after_a_stop_that_was_cut_off_the_next_motion_begins_at_zero():
-    bench = Bench.driving(config=dataclasses.replace(CONFIG, stop_deceleration_rad_s2=2.0))
-    bench.command = None
-    while bench.step().driver_enabled:
-        pass
     bench.run_until("STANDBY", within_ms=10)
     bench.to_armed(session=8)
     assert bench.out.driver_enabled
     assert setpoints(bench) == (0.0, 0.0)
 
 
-def test_a_stop_that_does_not_end_is_ended():
-    bench = Bench.driving(config=dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
-    bench.wheels_follow = False
+def test_a_stop_or_an_estop_that_does_not_end_is_ended():
+    endless = Bench.driving(config=dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
+    endless.wheels_follow = False
+    bench = endless.copy()
     bench.set_request("STANDBY").run_until("STOPPING")
     start = bench.now_us
     bench.run_until("STANDBY")
     assert bench.now_us - start == 300 * MS
     assert (bench.out.driver_enabled, bench.out.brake) == (False, True)
-
-
-def test_an_estop_that_does_not_end_lets_the_driver_go():
-    bench = Bench.driving(config=dataclasses.replace(CONFIG, drive_off_timeout_s=2.0, stop_timeout_s=0.3))
-    bench.wheels_follow = False
-    assert len(stop(bench, STOPS["estop"])) == 299
+    assert len(stop(endless, STOPS["estop"])) == 299
 
 
 def test_latched_fault_lets_the_driver_go_at_once_even_in_a_stop():
     bench = Bench.driving()
-    bench.core.receive(bench.now_us, 0x080, b"")
-    assert bench.step().driver_enabled
+    assert bench.estop().driver_enabled
     bench.inputs["left_ticks"] = 1 << 20
     bench.step()
     assert (bench.out.state, bench.out.driver_enabled, bench.out.brake) == ("ESTOP", False, True)
-
-
-def test_a_braked_robot_stays_braked_when_it_is_stopped():
-    bench = Bench.driving()
-    bench.command = {"mode": "BRAKE"}
-    bench.run(400)
-    bench.wheels_follow = False
-    bench.speeds = [1.0, 1.0]
-    bench.core.receive(bench.now_us, 0x080, b"")
-    assert (bench.step().driver_enabled, bench.out.brake) == (False, True)
-
-
-def test_a_stop_does_not_begin_again():
-    bench = Bench.driving()
-    stop(bench, STOPS["estop"])
-    bench.wheels_follow = False
-    bench.speeds = [2.0, 2.0]
-    for _ in range(100):
-        assert not bench.step().driver_enabled
 
 
 @pytest.mark.parametrize("cycle_us", [1 * MS, 5 * MS])

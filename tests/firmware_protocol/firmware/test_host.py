@@ -5,9 +5,9 @@ import itertools
 
 import pytest
 
-from firmware_protocol.firmware_core import FirmwareCore, FirmwareInputs
+from firmware_protocol.firmware_core import FirmwareCore
 from firmware_protocol.protection import challenge_answer
-from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, Bench, sealed
+from tests.firmware_protocol.bench import CODEC, CONFIG, FAULTS, MS, STATIONARY, Bench, sealed
 from tests.tables import thinned
 
 
@@ -44,7 +44,7 @@ def test_a_host_of_another_major_is_heard_refused_and_answered(major, bench):
 
 def test_firmware_of_another_major_is_understood_as_such_and_nothing_else_of_it_is():
     core = FirmwareCore(dataclasses.replace(CONFIG, protocol_major=2))
-    core.step(1000, FirmwareInputs(left_ticks=0, right_ticks=0, left_speed_rad_s=0.0, right_speed_rad_s=0.0))
+    core.step(1000, STATIONARY)
     decoded = {can_id: CODEC.decode(can_id, data) for can_id, data in core.drain()}
     assert decoded.pop(0x140).values["protocol_major"] == 2
     assert {fault.reason.value for fault in decoded.values()} == {"crc"}
@@ -114,25 +114,11 @@ def test_a_host_that_babbles_is_disqualified_and_motion_stops():
     assert (bench.out.state, bench.out.stop_cause) == ("STOPPING", "E2E_DISQUALIFIED")
 
 
-@pytest.mark.parametrize("session", [0, 7])
-def test_session_zero_and_the_last_session_are_refused(session):
-    bench = Bench.ready(session=7)
-    bench.set_request("STANDBY").run_until("STANDBY")
-    assert bench.set_request("READY", session=session).run(300).state == "STANDBY"
-    assert "SESSION" in bench.blockers()
-    assert bench.set_request("READY", session=8).run_until("READY").session == 8
-
-
-def test_session_dies_with_ready_and_armed():
-    bench = Bench.driving()
-    assert bench.out.session == 7
-    bench.command = None
-    assert bench.run_until("STOPPING").session == 0
-
-
-def test_it_never_arms_again_by_itself():
+def test_a_session_dies_with_the_stop_and_it_never_arms_again_by_itself():
     bench = Bench.driving()
     command, bench.command = bench.command, None
+    assert bench.out.session == 7
+    assert bench.run_until("STOPPING").session == 0
     bench.run_until("STANDBY")
     bench.command = command
     for request in ("ARM", "READY", "ARM"):
@@ -235,24 +221,23 @@ def test_arming_another_session_than_the_one_that_is_ready_starts_over():
 
 def arm_with(respond):
     bench = Bench.ready()
-    bench.command = {}
-    bench.answers = False
-    bench.set_request("ARM", challenge_answer=respond(bench)).run(400)
+    bench.command, bench.answers = {}, False
+    bench.set_request("ARM", challenge_answer=respond(bench.core.challenge)).run(400)
     return bench
 
 
 def test_right_answer_arms():
-    assert arm_with(lambda b: challenge_answer(b.core.challenge, 7, CODEC.dbc_hash)).out.state == "ARMED"
+    assert arm_with(lambda challenge: challenge_answer(challenge, 7, CODEC.dbc_hash)).out.state == "ARMED"
 
 
 @pytest.mark.parametrize(
     "respond",
     [
-        lambda b: 0,
-        lambda b: b.core.challenge,
-        lambda b: challenge_answer(b.core.challenge, 8, CODEC.dbc_hash),
-        lambda b: challenge_answer(b.core.challenge, 7, CODEC.dbc_hash ^ 1),
-        lambda b: challenge_answer(b.core.challenge ^ 1, 7, CODEC.dbc_hash),
+        lambda challenge: 0,
+        lambda challenge: challenge,
+        lambda challenge: challenge_answer(challenge, 8, CODEC.dbc_hash),
+        lambda challenge: challenge_answer(challenge, 7, CODEC.dbc_hash ^ 1),
+        lambda challenge: challenge_answer(challenge ^ 1, 7, CODEC.dbc_hash),
     ],
 )
 def test_wrong_answer_does_not(respond):
@@ -279,41 +264,26 @@ def test_answer_given_in_standby_is_no_answer():
     assert bench.set_request("ARM").run(300).state == "READY"
 
 
-def test_arming_waits_for_wheels_that_stand():
-    bench = Bench.ready()
+def test_arming_waits_for_wheels_below_the_speed_of_stillness():
+    bench = Bench.ready(config=dataclasses.replace(CONFIG, still_speed_rad_s=0.0625))
     bench.wheels_follow = False
-    bench.speeds = [0.0, -0.06]
+    bench.speeds = [0.0, -0.0625]
     bench.command = {}
     assert bench.set_request("ARM").run(400).state == "READY"
     assert bench.blockers() == {"WHEELS_MOVING"}
-    bench.speeds = [0.0, -0.04]
+    bench.speeds = [0.0, -0.0624]
     assert bench.run(2).state == "ARMED"
     assert bench.out.blockers == 0
 
 
-def test_wheels_stand_below_the_speed_of_stillness_and_not_at_it():
-    bench = Bench(dataclasses.replace(CONFIG, still_speed_rad_s=0.0625))
-    bench.wheels_follow = False
-    bench.speeds = [0.0, -0.0625]
-    bench.step()
-    assert "WHEELS_MOVING" in bench.blockers()
-    bench.speeds = [0.0, -0.0624]
-    bench.step()
-    assert "WHEELS_MOVING" not in bench.blockers()
-
-
-def estopped():
+def estopped(rolling=False):
     bench = Bench.driving()
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.command = None
     assert bench.set_request("ARM").run(800).state == "ESTOP"
-    return bench
-
-
-def estopped_and_rolling():
-    bench = estopped()
-    bench.wheels_follow = False
-    bench.speeds = [1.0, 1.0]
+    if rolling:
+        bench.wheels_follow = False
+        bench.speeds = [1.0, 1.0]
     return bench
 
 
@@ -345,33 +315,30 @@ def test_a_reset_that_was_asked_for_before_a_silence_does_not_clear_what_came_in
 
 
 def test_a_reset_waits_for_stillness_and_is_void_when_the_stop_comes_again():
-    bench = estopped_and_rolling()
+    bench = estopped(rolling=True)
     assert bench.set_request("RESET").run(300).state == "ESTOP"
     bench.core.receive(bench.now_us, 0x080, b"")
     bench.speeds = [0.0, 0.0]
     assert bench.run(1000).state == "ESTOP"
 
 
-@pytest.mark.parametrize("end", ["another request", "silence"])
-def test_a_reset_no_longer_asked_for_is_void(end):
-    bench = estopped_and_rolling()
+def test_a_reset_is_void_once_another_request_comes():
+    bench = estopped(rolling=True)
     bench.set_request("RESET").run(100)
-    bench.request = None
-    if end == "another request":
-        bench.set_request("STANDBY")
-    bench.run(700)
+    bench.set_request("STANDBY").run(700)
     bench.speeds = [0.0, 0.0]
     assert bench.run(300).state == "ESTOP"
 
 
-def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer():
-    for silent_ms, state in ((500, "STANDBY"), (501, "ESTOP")):
-        bench = estopped_and_rolling()
-        bench.set_request("RESET").run(50 - bench.now_us // MS % 50)
-        bench.request = None
-        assert bench.run(silent_ms - 1).state == "ESTOP"
-        bench.speeds = [0.0, 0.0]
-        assert bench.step().state == state
+@pytest.mark.parametrize(("silent_ms", "state"), [(500, "STANDBY"), (501, "ESTOP"), (700, "ESTOP")])
+def test_a_reset_is_asked_for_until_the_host_is_silent_and_no_longer(silent_ms, state):
+    bench = estopped(rolling=True)
+    bench.set_request("RESET").run(50 - bench.now_us // MS % 50)
+    bench.request = None
+    assert bench.run(silent_ms - 1).state == "ESTOP"
+    bench.speeds = [0.0, 0.0]
+    assert bench.step().state == state
+    assert bench.run(300).state == state
 
 
 @pytest.mark.parametrize("source", ["estop_button", "estop_line"])

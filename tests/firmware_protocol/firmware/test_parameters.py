@@ -72,29 +72,17 @@ def test_unknown_key_and_operation():
 
 
 @pytest.mark.parametrize("state", ["READY", "ARMED", "STOPPING", "moving ESTOP"])
-def test_writing_is_refused_unless_disarmed(state, bench):
-    if state == "READY":
-        bench.to_ready()
-    else:
-        bench.to_driving()
-    if state == "STOPPING":
-        bench.set_request("STANDBY").run_until("STOPPING")
-    elif state == "moving ESTOP":
-        bench.core.receive(bench.now_us, 0x080, b"")
-        bench.step()
+def test_writing_is_refused_unless_disarmed(state):
+    bench = Bench.in_state("ARMED" if state == "moving ESTOP" else state)
+    if state == "moving ESTOP":
+        bench.estop()
     assert request_parameter(bench, "WRITE", 4, 50.0)[0] == "REFUSED_ARMED"
     assert request_parameter(bench, "READ", 4)[2] == CONFIG.stop_deceleration_rad_s2
 
 
 @pytest.mark.parametrize("state", ["FAULT", "ESTOP"])
-def test_writing_is_allowed_in_a_state_that_does_not_move(state, bench):
-    if state == "FAULT":
-        bench.inputs["left_current_a"] = 40.0
-        bench.run_until("FAULT")
-    else:
-        bench.core.receive(bench.now_us, 0x080, b"")
-        bench.step()
-    assert request_parameter(bench, "WRITE", 1, 60.0) == ("OK", 1, 60.0)
+def test_writing_is_allowed_in_a_state_that_does_not_move(state):
+    assert request_parameter(Bench.in_state(state), "WRITE", 1, 60.0) == ("OK", 1, 60.0)
 
 
 def test_a_written_value_is_in_force_and_told_in_limits(bench):

@@ -49,9 +49,10 @@ def test_approach_keeps_to_the_step_and_to_the_straight_line(left, right, to_lef
         assert (result.left, result.right) == (to_left, to_right)
 
 
-def test_approach_with_no_step_stays():
-    result = lib.disco_approach(wheels(1.0, 2.0), wheels(3.0, 3.0), 0.0)
-    assert (result.left, result.right) == (1.0, 2.0)
+@pytest.mark.parametrize("target", [(3.0, 3.0), (1.0, -2.0)], ids=["elsewhere", "at the target"])
+def test_approach_with_no_step_stays_and_is_a_number(target):
+    result = lib.disco_approach(wheels(1.0, -2.0), wheels(*target), 0.0)
+    assert (result.left, result.right) == (1.0, -2.0)
 
 
 def test_largest_and_equal():
@@ -60,8 +61,3 @@ def test_largest_and_equal():
     assert lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(1.0, 2.0))
     assert not lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(2.0, 2.0))
     assert not lib.disco_wheels_equal(wheels(1.0, 2.0), wheels(1.0, 1.0))
-
-
-def test_approach_with_no_step_from_the_target_stays_and_is_a_number():
-    result = lib.disco_approach(wheels(1.0, -2.0), wheels(1.0, -2.0), 0.0)
-    assert (result.left, result.right) == (1.0, -2.0)

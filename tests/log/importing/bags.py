@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from contextlib import contextmanager
 
+import msgspec
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from disco_hw.config import Ros2
+from disco_hw.log.importing.rosbag import read_rosbag
 from tests.inference.drives import logged, robot_config
 
 BEGAN_NS = 1_700_000_000_000_000_000
@@ -66,14 +69,8 @@ class Maker:
         return self.create("geometry_msgs/msg/TwistStamped", self.header(t_ns, "base_link"), self.twist(v, w))
 
     def joints(self, t_ns, names, positions, speeds):
-        return self.create(
-            "sensor_msgs/msg/JointState",
-            self.header(t_ns, ""),
-            list(names),
-            np.array(positions, dtype=np.float64),
-            np.array(speeds, dtype=np.float64),
-            np.zeros(0),
-        )
+        numbers = (np.array(positions, dtype=np.float64), np.array(speeds, dtype=np.float64), np.zeros(0))
+        return self.create("sensor_msgs/msg/JointState", self.header(t_ns, ""), list(names), *numbers)
 
     def wheels(self, k, angle=None, speeds=(5.0,) * 4, *, stamp_ns=None, log_ns=None):
         """Write sample k, at 50 Hz, of four wheels that turn at 5 rad/s."""
@@ -84,14 +81,17 @@ class Maker:
     def pose_stamped(self, t_ns, frame, x, y, yaw):
         return self.create("geometry_msgs/msg/PoseStamped", self.header(t_ns, frame), self.pose(x, y, yaw))
 
-    def pose_covariance(self, t_ns, frame, x, y, yaw):
-        inner = self.create("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
-        return self.create("geometry_msgs/msg/PoseWithCovarianceStamped", self.header(t_ns, frame), inner)
+    def with_covariance(self, x, y, yaw):
+        return self.create("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
+
+    def pose_covariance(self, t_ns, frame, *pose):
+        header, inner = self.header(t_ns, frame), self.with_covariance(*pose)
+        return self.create("geometry_msgs/msg/PoseWithCovarianceStamped", header, inner)
 
     def odometry(self, t_ns, frame, x, y, yaw, v=0.0, w=0.0):
-        inner = self.create("geometry_msgs/msg/PoseWithCovariance", self.pose(x, y, yaw), np.zeros(36))
+        header, inner = self.header(t_ns, frame), self.with_covariance(x, y, yaw)
         twist = self.create("geometry_msgs/msg/TwistWithCovariance", self.twist(v, w), np.zeros(36))
-        return self.create("nav_msgs/msg/Odometry", self.header(t_ns, frame), "base_link", inner, twist)
+        return self.create("nav_msgs/msg/Odometry", header, "base_link", inner, twist)
 
     def transforms(self, t_ns, *edges):
         one = [
@@ -123,6 +123,18 @@ def bag(path, storage="mcap", distro=Stores.ROS2_HUMBLE, version=9):
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer2(path, version=version, storage_plugin=plugin) as writer:
         yield Maker(writer, get_typestore(distro), False)
+
+
+def config(**ros2):
+    return msgspec.structs.replace(robot_config(), ros2=Ros2(**ros2))
+
+
+def read_bag(path, count, write_sample, **ros2):
+    """The drive that is read from a bag into which `write_sample(maker, k)` has written each sample."""
+    with bag(path) as maker:
+        for k in range(count):
+            write_sample(maker, k)
+    return read_rosbag(path, config(**ros2))
 
 
 def minus(a, b):
@@ -175,23 +187,16 @@ def recorded(path, storage="mcap", distro=Stores.ROS2_HUMBLE, drive=None, cut_s=
         at(t, "/joint_states", lambda m, t=t, p=angles, s=speeds, n=names: m.joints(stamp(t), n, p, s))
         v, w = r * (left_speed + right_speed) / 2, r * (right_speed - left_speed) / a
         at(t, "/odom", lambda m, t=t, o=tuple(odom), v=v, w=w: m.odometry(stamp(t), "odom", *o, v, w))
-        at(
-            t,
-            "/tf",
-            lambda m, t=t, o=tuple(odom): m.transforms(stamp(t), ("odom", "base_footprint", o[0], o[1], 0.0, o[2])),
-        )
+        edge = ("odom", "base_footprint", odom[0], odom[1], 0.0, odom[2])
+        at(t, "/tf", lambda m, t=t, edge=edge: m.transforms(stamp(t), edge))
     track = np.array(track)
     at(-0.05, "/tf_static", lambda m: m.transforms(0, ("base_footprint", "base_link", 0.0, 0.0, 0.1, 0.0)))
     for k, (t, x, y, yaw) in enumerate(zip(poses.t_s, poses.x_m, poses.y_m, poses.yaw_rad, strict=True)):
         base = [np.interp(t, track[:, 0], track[:, i]) for i in (1, 2, 3)]
         o = minus((x, y, yaw), base)
-        for again in (0.0, 0.02):
-            ahead = t + again
-            at(
-                ahead,
-                "/tf",
-                lambda m, t=ahead, o=o: m.transforms(stamp(t + 0.5), ("map", "odom", o[0], o[1], 0.0, o[2])),
-            )
+        edge = ("map", "odom", o[0], o[1], 0.0, o[2])
+        for again in (t, t + 0.02):
+            at(again, "/tf", lambda m, t=again, edge=edge: m.transforms(stamp(t + 0.5), edge))
         at(t, "/rtabmap/odom", lambda m, t=t, p=(x, y, yaw): m.odometry(stamp(t), "map", *p))
         if k % 25 == 0:
             at(t, "/amcl_pose", lambda m, t=t, p=(x, y, yaw): m.pose_covariance(stamp(t), "map", *p))

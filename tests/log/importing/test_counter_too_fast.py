@@ -14,10 +14,8 @@ TICKS_PER_RAD = TICKS_PER_REV / (2.0 * np.pi)
 
 
 def write(path, t_s, ticks, speed_rad_s):
-    rows = [
-        f"{t:.3f},{speed_rad_s},{speed_rad_s},{left:.0f},{right:.0f}"
-        for t, (left, right) in zip(t_s, ticks, strict=True)
-    ]
+    commanded = f"{speed_rad_s},{speed_rad_s}"
+    rows = [f"{t:.3f},{commanded},{left:.0f},{right:.0f}" for t, (left, right) in zip(t_s, ticks, strict=True)]
     header = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_ticks,enc_right_ticks"
     path.write_text("\n".join([header, *rows]) + "\n")
 

@@ -6,8 +6,8 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from disco_hw.errors import LogError
 from disco_hw.log.importing.csv_drive import read_csv
+from tests.log.refusals import refused
 
 COLUMNS = (
     "t_s", "cmd_left_rad_s", "cmd_right_rad_s", "enc_left_rad_s", "enc_right_rad_s", "pose_x_m", "pose_y_m",
@@ -39,9 +39,8 @@ def read(tmp_path, content, **settings):
 
 
 def refusal(tmp_path, content, **settings):
-    with pytest.raises(LogError) as error:
+    with refused() as error:
         read(tmp_path, content, **settings)
-    assert "\n" not in str(error.value)
     return str(error.value)
 
 
@@ -85,29 +84,26 @@ def test_a_cell_that_is_no_number_costs_its_sample_and_no_other(tmp_path, text, 
     assert not only_note(drive).startswith("warning: ")
 
 
-def test_over_5_percent_of_a_signal_is_a_warning_and_over_half_an_error(tmp_path):
-    def spoilt(count):
-        rows = table()
-        for row in rows[:count]:
-            row["pose_y_m"] = "lost"
-        return as_text(rows)
-
-    assert not only_note(read(tmp_path, spoilt(5))).startswith("warning: ")
-    assert only_note(read(tmp_path, spoilt(6))).startswith("warning: ")
-    assert only_note(read(tmp_path, spoilt(50))).startswith("warning: ")
-    assert "positions: 51 of 100 have a cell that is not a number" in refusal(tmp_path, spoilt(51))
+def with_lost_positions(count):
+    rows = table()
+    for row in rows[:count]:
+        row["pose_y_m"] = "lost"
+    return as_text(rows)
 
 
-def test_rows_of_another_width_are_left_out(tmp_path):
+@pytest.mark.parametrize(("count", "warns"), [(5, False), (6, True), (50, True)])
+def test_over_5_percent_of_a_signal_is_a_warning_and_over_half_an_error(tmp_path, count, warns):
+    assert only_note(read(tmp_path, with_lost_positions(count))).startswith("warning: ") is warns
+    assert "positions: 51 of 100 have a cell that is not a number" in refusal(tmp_path, with_lost_positions(51))
+
+
+def test_rows_of_another_width_or_without_a_time_are_left_out(tmp_path):
     lines = as_text(table()).splitlines()
     lines[10] += ",7"
     lines[20] = "1.0,2.0"
     drive = read(tmp_path, "\n".join(lines) + "\n")
     assert sizes(drive) == (98, 98, 98)
     assert "2 of 100 do not have the 8 cells of the header and were left out, the first in line 11" in only_note(drive)
-
-
-def test_a_row_without_a_time_is_left_out(tmp_path):
     rows = table()
     rows[30]["t_s"], rows[31]["t_s"] = "", "x"
     drive = read(tmp_path, as_text(rows))

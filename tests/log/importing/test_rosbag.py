@@ -4,7 +4,6 @@ import json
 import math
 from itertools import product
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -12,23 +11,14 @@ pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
 
 from rosbags.typesys import Stores
 
-from disco_hw.config import Ros2
 from disco_hw.errors import LogError
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
-from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, bag, recorded, time_ns
+from tests.log.importing.bags import BEGAN_NS, LATENCY_NS, LEFT, RIGHT, config, read_bag, recorded, time_ns
 from tests.log.importing.commands import call
 from tests.tables import thinned
-
-
-def config(**settings):
-    return msgspec.structs.replace(robot_config(), ros2=Ros2(**settings))
-
-
-def place(tmp_path, storage="mcap"):
-    return tmp_path / ("run.bag" if storage == "ros1" else "run")
 
 
 def has_note(drive, text):
@@ -50,17 +40,27 @@ RELEASES = [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED]
 BAGS = [*product(["mcap", "sqlite3"], RELEASES), ("ros1", Stores.ROS1_NOETIC)]
 
 
+def recorded_and_read(path, **settings):
+    """The drive that a bag of all topics was made of, and what is read from it."""
+    return recorded(path, **settings), read_rosbag(path, robot_config())
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run"
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A bag of all topics, the drive that it is of, and what is read from it."""
-    path = place(tmp_path_factory.mktemp("bag"))
-    return path, recorded(path), read_rosbag(path, robot_config())
+    path = tmp_path_factory.mktemp("bag") / "run"
+    return path, *recorded_and_read(path)
 
 
 @thinned(("storage", "distro"), BAGS, quick=1)
 def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage, distro):
-    truth = recorded(place(tmp_path, storage), storage, distro)
-    drive = read_rosbag(place(tmp_path, storage), robot_config())
+    path = tmp_path / ("run.bag" if storage == "ros1" else "run")
+    truth, drive = recorded_and_read(path, storage=storage, distro=distro)
     assert chosen(drive) == [("commands", "/cmd_vel"), ("wheels", "/joint_states"), ("poses", "tf")]
     assert_same_wheels(drive, truth)
     given = np.isfinite(drive.commands.left_rad_s)
@@ -76,12 +76,15 @@ def test_four_wheels_commands_and_the_chain_of_frames_are_read(tmp_path, storage
 
 def test_every_topic_is_in_the_table_with_the_reason(made):
     table = made[2].notes[0]
-    assert "left: front_left_wheel_joint, rear_left_wheel_joint; right: front_right_wheel_joint" in table
-    assert "map - odom - base_footprint - base_link" in table
-    assert "/rtabmap/odom" in table
-    assert "by frame and name the odometry of the wheels" in table
-    assert "/goal_pose" in table
-    assert "not where the robot is" in table
+    for part in (
+        "left: front_left_wheel_joint, rear_left_wheel_joint; right: front_right_wheel_joint",
+        "map - odom - base_footprint - base_link",
+        "/rtabmap/odom",
+        "by frame and name the odometry of the wheels",
+        "/goal_pose",
+        "not where the robot is",
+    ):
+        assert part in table
     assert "camera" not in table
 
 
@@ -96,38 +99,34 @@ def test_a_topic_that_is_asked_for_is_taken_instead(made):
     assert has_note(drive, "has been through the robot's own kinematics")
 
 
-def test_without_joint_states_the_odometry_serves_and_that_is_said(tmp_path):
-    truth = recorded(place(tmp_path), leave=("/joint_states",))
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_without_joint_states_the_odometry_serves_and_that_is_said(path):
+    truth, drive = recorded_and_read(path, leave=("/joint_states",))
     assert ("wheels", "/odom") in chosen(drive)
     np.testing.assert_allclose(drive.wheels.right_speed_rad_s, truth.wheels.right_speed_rad_s, atol=1e-9)
     assert has_note(drive, "record /joint_states")
 
 
-def test_odometry_of_the_wheels_is_never_taken_for_a_measured_pose(tmp_path):
-    recorded(place(tmp_path), leave=("/rtabmap/odom", "/amcl_pose", "/tf"))
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_odometry_of_the_wheels_is_never_taken_for_a_measured_pose(path):
+    _, drive = recorded_and_read(path, leave=("/rtabmap/odom", "/amcl_pose", "/tf"))
     assert not drive.poses.t_s.size
     assert has_note(drive, "no topic holds poses that were not made from the wheels")
 
 
-def test_names_of_joints_and_frames_that_nobody_guesses_can_be_set(tmp_path):
-    with bag(place(tmp_path)) as maker:
-        for k in range(100):
-            t_ns = time_ns(k)
-            maker.write("/joints", maker.joints(t_ns, ("a", "b"), (0.1 * k, 0.2 * k), (5.0, 10.0)), t_ns)
-            maker.write("/tf", maker.transforms(t_ns, ("hall", "rover", 0.006 * k, 0.0, 0.0, 0.0)), t_ns)
-    with pytest.raises(LogError, match="no topic with commands, wheels or poses"):
-        read_rosbag(place(tmp_path), robot_config())
+def test_names_of_joints_and_frames_that_nobody_guesses_can_be_set(path):
+    def write(maker, k):
+        maker.write("/joints", maker.joints(time_ns(k), ("a", "b"), (0.1 * k, 0.2 * k), (5.0, 10.0)), time_ns(k))
+        maker.write("/tf", maker.transforms(time_ns(k), ("hall", "rover", 0.006 * k, 0.0, 0.0, 0.0)), time_ns(k))
+
     names = {"left_joints": ["a"], "right_joints": ["b"], "map_frame": "hall", "base_frame": "rover"}
-    drive = read_rosbag(place(tmp_path), config(**names))
+    drive = read_bag(path, 100, write, **names)
     assert drive.wheels.right_angle_rad[-1] == pytest.approx(19.8)
     assert drive.poses.x_m[-1] == pytest.approx(0.594)
+    with pytest.raises(LogError, match="no topic with commands, wheels or poses"):
+        read_rosbag(path, robot_config())
 
 
-def test_a_gap_in_the_recording_starts_a_new_segment(tmp_path):
-    recorded(place(tmp_path), cut_s=(4.0, 7.0))
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_a_gap_in_the_recording_starts_a_new_segment(path):
+    _, drive = recorded_and_read(path, cut_s=(4.0, 7.0))
     assert drive.segments == 2
     assert np.diff(drive.wheels.t_s).max() == pytest.approx(3.0, abs=0.05)
     # What was commanded last holds for half a second, as the controllers of ROS have it.
@@ -135,20 +134,18 @@ def test_a_gap_in_the_recording_starts_a_new_segment(tmp_path):
 
 
 @thinned("by_s", [-30.0, 30.0], quick=1)
-def test_a_clock_that_is_set_is_said_and_taken_out(tmp_path, by_s):
-    truth = recorded(place(tmp_path), clock=lambda t_s: by_s if t_s > 5.0 else 0.0)
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_a_clock_that_is_set_is_said_and_taken_out(path, by_s):
+    truth, drive = recorded_and_read(path, clock=lambda t_s: by_s if t_s > 5.0 else 0.0)
     assert has_note(drive, f"the clock of the stamps was set {'back' if by_s < 0 else 'ahead'} by 30 s")
     assert_same_wheels(drive, truth)
     assert drive.segments == 2
     assert drive.poses.t_s[-1] == pytest.approx(drive.wheels.t_s[-1], abs=0.2)
 
 
-def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(tmp_path):
+def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(path):
     """A simulation at half the speed of time, whose clock began at 100 s."""
     start_s = 100.0 - BEGAN_NS * 1e-9
-    truth = recorded(place(tmp_path), clock=lambda t_s: start_s - 0.5 * t_s)
-    drive = read_rosbag(place(tmp_path), robot_config())
+    truth, drive = recorded_and_read(path, clock=lambda t_s: start_s - 0.5 * t_s)
     assert has_note(drive, "a simulated clock, or one that was not set")
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.5 * np.diff(truth.wheels.t_s), atol=1e-6)
     given = drive.commands.t_s[np.isfinite(drive.commands.left_rad_s)]
@@ -156,32 +153,26 @@ def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(tmp_p
     np.testing.assert_allclose(given - given[0], expected - expected[0], atol=2e-3)
 
 
-def test_messages_without_a_stamp_have_the_time_of_recording_and_that_is_said(tmp_path):
-    with bag(place(tmp_path)) as maker:
-        for k in range(200):
-            maker.wheels(k, stamp_ns=0 if k % 10 == 0 else None)
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_messages_without_a_stamp_have_the_time_of_recording_and_that_is_said(path):
+    drive = read_bag(path, 200, lambda maker, k: maker.wheels(k, stamp_ns=None if k % 10 else 0))
     assert has_note(drive, "20 of 200 messages have no stamp")
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
 
 
-def test_the_stamp_counts_not_the_recording(tmp_path):
+def test_the_stamp_counts_not_the_recording(path):
     """Messages that the network held up for a while and then let go at once."""
-    with bag(place(tmp_path)) as maker:
-        for k in range(200):
-            maker.wheels(k, log_ns=time_ns(120 if 80 <= k < 120 else k) + k)
-    drive = read_rosbag(place(tmp_path), robot_config())
+    drive = read_bag(path, 200, lambda maker, k: maker.wheels(k, log_ns=time_ns(120 if 80 <= k < 120 else k) + k))
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-6)
     assert drive.segments == 1
 
 
-def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
-    with bag(place(tmp_path)) as maker:
-        for k in range(50):
-            x = math.inf if k in {3, 4} else 0.0
-            maker.wheels(k, math.nan if k == 7 else None)
-            maker.write("/slam/pose", maker.pose_stamped(time_ns(k), "map", x, 0.0, 0.0), time_ns(k))
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_what_is_not_finite_is_left_out_and_counted(path):
+    def write(maker, k):
+        x = math.inf if k in {3, 4} else 0.0
+        maker.wheels(k, math.nan if k == 7 else None)
+        maker.write("/slam/pose", maker.pose_stamped(time_ns(k), "map", x, 0.0, 0.0), time_ns(k))
+
+    drive = read_bag(path, 50, write)
     assert (drive.wheels.t_s.size, drive.poses.t_s.size) == (49, 48)
     assert has_note(drive, "poses, /slam/pose: 2 of 50 messages hold no finite value")
     assert has_note(drive, "wheels: 1 of 50 messages lack a position or velocity")
@@ -190,24 +181,21 @@ def test_what_is_not_finite_is_left_out_and_counted(tmp_path):
 @pytest.mark.parametrize(
     ("reset_rad", "burst", "segments"), [(80.0, False, 2), (4.0, False, 2), (0.0, False, 1), (0.0, True, 1)]
 )
-def test_where_a_driver_counts_anew_nothing_is_predicted_across(tmp_path, reset_rad, burst, segments):
-    with bag(place(tmp_path)) as maker:
-        for k in range(300):
-            # In a burst one comes right after the one before.
-            t_ns = time_ns(k) - (19_900_000 if burst and k == 200 else 0)
-            maker.wheels(k, 0.4 * k - (reset_rad if k >= 200 else 0.0), [], stamp_ns=t_ns, log_ns=t_ns)
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_where_a_driver_counts_anew_nothing_is_predicted_across(path, reset_rad, burst, segments):
+    def write(maker, k):
+        # In a burst one comes right after the one before.
+        t_ns = time_ns(k) - (19_900_000 if burst and k == 200 else 0)
+        maker.wheels(k, 0.4 * k - (reset_rad if k >= 200 else 0.0), [], stamp_ns=t_ns, log_ns=t_ns)
+
+    drive = read_bag(path, 300, write)
     assert drive.segments == segments
     assert has_note(drive, "1 times the wheels paused, or a clock or encoder was set") is (segments == 2)
     fast = np.abs(drive.wheels.left_speed_rad_s) > 30.0
     assert fast.any() == burst
 
 
-def test_positions_within_one_turn_are_made_continuous(tmp_path):
-    with bag(place(tmp_path)) as maker:
-        for k in range(200):
-            maker.wheels(k, (0.1 * k + math.pi) % (2 * math.pi) - math.pi, [])
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_positions_within_one_turn_are_made_continuous(path):
+    drive = read_bag(path, 200, lambda maker, k: maker.wheels(k, (0.1 * k + math.pi) % (2 * math.pi) - math.pi, []))
     assert drive.wheels.left_angle_rad[-1] == pytest.approx(19.9)
     np.testing.assert_allclose(drive.wheels.left_speed_rad_s[1:], 5.0, atol=1e-3)
     assert not drive.wheels.speed_measured
@@ -222,14 +210,13 @@ def test_positions_within_one_turn_are_made_continuous(tmp_path):
         ("/velocity_controller/commands", lambda m, t: array(m, [2.0, 5.0])),
     ],
 )
-def test_the_controllers_own_commands_come_before_cmd_vel(tmp_path, topic, build_message):
-    with bag(place(tmp_path)) as maker:
-        for k in range(50):
-            t_ns = time_ns(k)
-            maker.wheels(k)
-            maker.write("/cmd_vel", maker.twist(0.0, 9.0), t_ns)
-            maker.write(topic, build_message(maker, t_ns), t_ns)
-    drive = read_rosbag(place(tmp_path), robot_config())
+def test_the_controllers_own_commands_come_before_cmd_vel(path, topic, build_message):
+    def write(maker, k):
+        maker.wheels(k)
+        maker.write("/cmd_vel", maker.twist(0.0, 9.0), time_ns(k))
+        maker.write(topic, build_message(maker, time_ns(k)), time_ns(k))
+
+    drive = read_bag(path, 50, write)
     assert chosen(drive)[0] == ("commands", topic)
     np.testing.assert_allclose(drive.commands.left_rad_s[:-1], 2.0)
     np.testing.assert_allclose(drive.commands.right_rad_s[:-1], 5.0)
@@ -261,9 +248,9 @@ def test_a_topic_that_is_no_role_and_name_is_refused(robot, tmp_path, made, topi
 
 
 @pytest.mark.parametrize(("role", "hint"), [("wheels", "set ros2.left_joints"), ("commands", "name another")])
-def test_joints_that_are_no_wheels_are_refused_as_a_named_topic(tmp_path, role, hint):
-    with bag(place(tmp_path)) as maker:
-        for k in range(20):
-            maker.write("/arm", maker.joints(time_ns(k), ("elbow", "wrist"), [0.1 * k, 0.2], [0.1, 0.2]), time_ns(k))
+def test_joints_that_are_no_wheels_are_refused_as_a_named_topic(path, role, hint):
+    def write(maker, k):
+        maker.write("/arm", maker.joints(time_ns(k), ("elbow", "wrist"), [0.1 * k, 0.2], [0.1, 0.2]), time_ns(k))
+
     with pytest.raises(LogError, match=hint):
-        read_rosbag(place(tmp_path), config(**{f"{role.removesuffix('s')}_topic": "/arm"}))
+        read_bag(path, 20, write, **{f"{role.removesuffix('s')}_topic": "/arm"})

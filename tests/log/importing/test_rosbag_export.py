@@ -14,14 +14,11 @@ from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export_rosbag
 from tests.inference.drives import robot_config, write_log
-from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.commands import call
 
 
 @pytest.fixture
-def log(tmp_path):
-    robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT)
+def log(tmp_path, robot):
     return import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap").out
 
 

@@ -7,7 +7,6 @@ import struct
 import subprocess
 import sys
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -19,14 +18,14 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from disco_hw.config import Ros2
 from disco_hw.errors import InputError, LogError
 from disco_hw.log.importing import format_of, import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from tests.inference.drives import robot_config
-from tests.inference.test_infer_command import ROBOT
-from tests.log.importing.bags import BEGAN_NS, Maker, bag, recorded
+from tests.log.importing.bags import BEGAN_NS, Maker, bag, config, recorded
+from tests.log.importing.commands import refusal_of_import
+from tests.log.refusals import refused
 from tests.tables import thinned
 
 
@@ -42,27 +41,27 @@ def file_of(folder):
     return next(one for one in folder.iterdir() if one.suffix in {".mcap", ".db3"})
 
 
-def one_line(error):
-    return "\n" not in str(error.value)
+def small_file(folder, storage="mcap"):
+    """The file of a bag of wheel samples."""
+    path = small(folder / "b.bag", storage)
+    return path if storage == "ros1" else file_of(path)
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3", "ros1"])
 def test_bags_are_recognised_by_their_first_bytes(tmp_path, storage):
-    path = small(tmp_path / "b.bag", storage)
-    path = path if storage == "ros1" else file_of(path)
+    path = small_file(tmp_path, storage)
     assert format_of(path.read_bytes()[:64]).name == "rosbag"
     assert read_rosbag(path, robot_config()).wheels.t_s.size == 50
 
 
 def test_a_log_of_ours_is_no_bag():
-    assert (
-        format_of(b"\x89MCAP0\r\n\x01\x10" + bytes(7) + struct.pack("<I", 0) + b"\x08\0\0\0disco-hw").name != "rosbag"
-    )
+    begin = b"\x89MCAP0\r\n\x01\x10" + bytes(7) + struct.pack("<I", 0) + b"\x08\0\0\0disco-hw"
+    assert format_of(begin).name != "rosbag"
 
 
 def test_what_infer_is_given_as_a_bag_is_to_be_imported_first(tmp_path):
     with pytest.raises(LogError, match=r"a rosbag; make it a log with `disco-hw import"):
-        load_drive(file_of(small(tmp_path / "b")))
+        load_drive(small_file(tmp_path))
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +96,8 @@ def test_a_truncated_bag_is_read_as_far_as_it_is_whole(tmp_path, complete_bags, 
 def test_a_bag_that_was_cut_before_its_first_message_is_one_line(tmp_path, complete_bags, storage, size):
     path = tmp_path / f"b.{ENDINGS[storage]}"
     path.write_bytes(complete_bags[0][storage][:size])
-    with pytest.raises(LogError, match=r"b\.\w+: the bag cannot be read .*; record it again, or convert") as error:
+    with refused(r"b\.\w+: the bag cannot be read .*; record it again, or convert"):
         read_rosbag(path, robot_config())
-    assert one_line(error)
 
 
 @pytest.mark.thorough
@@ -161,8 +159,7 @@ def in_chunks(folder, kind):
 
 @thinned("storage", ["mcap", "sqlite3", "ros1"], quick=1)
 def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
-    source = small(tmp_path / "b.bag", storage)
-    source = source if storage == "ros1" else file_of(source)
+    source = small_file(tmp_path, storage)
     content, rng = source.read_bytes(), random.Random(3)
     for _ in range(60):
         spoilt = bytearray(content)
@@ -180,7 +177,7 @@ def test_a_mutated_bag_is_a_drive_or_one_line(tmp_path, storage):
 
 @pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
 def test_a_chunk_that_claims_any_size_is_read_as_one_that_was_cut(tmp_path, size):
-    path = file_of(small(tmp_path / "b"))
+    path = small_file(tmp_path)
     spoilt = bytearray(path.read_bytes())
     # The first record after the header: its opcode, then its length.
     header = struct.unpack_from("<Q", spoilt, 9)[0]
@@ -195,13 +192,12 @@ def test_a_chunk_that_claims_any_size_is_read_as_one_that_was_cut(tmp_path, size
 
 @pytest.mark.parametrize("size", [2**31, 2**40, 2**62, 2**64 - 1])
 def test_a_first_record_that_claims_any_size_is_one_line(tmp_path, size):
-    path = file_of(small(tmp_path / "b"))
+    path = small_file(tmp_path)
     spoilt = bytearray(path.read_bytes())
     struct.pack_into("<Q", spoilt, 9, size)
     path.write_bytes(spoilt)
-    with pytest.raises(LogError) as error:
+    with refused():
         read_rosbag(path, robot_config())
-    assert one_line(error)
 
 
 def test_a_message_that_claims_a_list_of_any_size_is_one_line(tmp_path):
@@ -211,13 +207,12 @@ def test_a_message_that_claims_a_list_of_any_size_is_one_line(tmp_path):
         for size in (2**31 - 1, 2**32 - 1):
             raw = b"\0\1\0\0" + struct.pack("<iII", 1, 0, 1) + b"\0\0\0\0" + struct.pack("<I", size)
             writer.write(connection, BEGAN_NS, raw)
-    with pytest.raises(LogError, match=r"/joint_states .*none of its messages can be decoded|needs over") as error:
+    with refused(r"/joint_states .*none of its messages can be decoded|needs over"):
         read_rosbag(tmp_path / "b", robot_config())
-    assert one_line(error)
 
 
 @pytest.mark.thorough
-def test_a_chunk_that_unpacks_to_more_than_memory_is_one_line(tmp_path):
+def test_a_chunk_that_unpacks_to_more_than_memory_is_one_line(tmp_path, robot):
     """3 GiB of zeros in 100 kB: in a process of its own, as what it takes must not stay."""
     import zstandard
 
@@ -229,21 +224,14 @@ def test_a_chunk_that_unpacks_to_more_than_memory_is_one_line(tmp_path):
     records = [(1, profile), (6, chunk), (2, bytes(20))]
     bomb = tmp_path / "bomb.mcap"
     bomb.write_bytes(magic + b"".join(struct.pack("<BQ", op, len(data)) + data for op, data in records) + magic)
-    robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT)
-    command = [sys.executable, "-m", "disco_hw", "import", str(bomb), "--robot", str(robot), "-o", str(tmp_path / "o")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=200)
-    assert done.returncode == 2, done.stderr
-    assert "bomb.mcap" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert "bomb.mcap" in refusal_of_import(bomb, robot, timeout=200)
 
 
 def test_a_bag_without_a_usable_topic_says_what_it_has(tmp_path):
     with bag(tmp_path / "b") as maker:
         maker.write("/twist_of_fate", maker.twist(0.0, 0.0), BEGAN_NS)
-    with pytest.raises(
-        LogError, match=r"/b: no topic with commands, wheels or poses; it has /twist_of_fate \(geometry"
-    ):
+    message = r"/b: no topic with commands, wheels or poses; it has /twist_of_fate \(geometry"
+    with pytest.raises(LogError, match=message):
         read_rosbag(tmp_path / "b", robot_config())
 
 
@@ -259,30 +247,26 @@ def test_a_bag_without_a_usable_topic_says_what_it_has(tmp_path):
     ],
 )
 def test_a_topic_that_is_not_there_is_named(tmp_path, settings, message):
-    with pytest.raises(LogError, match=message) as error:
-        read_rosbag(small(tmp_path / "b"), msgspec.structs.replace(robot_config(), ros2=Ros2(**settings)))
-    assert one_line(error)
+    with refused(message):
+        read_rosbag(small(tmp_path / "b"), config(**settings))
 
 
-def custom(path, storage, definition="float32[2] drivers"):
+def custom(path, storage):
     """A bag with a message type that ROS itself has not."""
-    small_types = get_types_from_msg(definition, "my_msgs/msg/Drive")
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    store.register(small_types)
+    store, kind = get_typestore(Stores.ROS2_HUMBLE), "my_msgs/msg/Drive"
+    store.register(get_types_from_msg("float32[2] drivers", kind))
+    raw = store.serialize_cdr(store.types[kind](np.array([2.0, 5.0], dtype=np.float32)), kind)
     with Writer(path, version=8, storage_plugin=storage) as writer:
-        connection = writer.add_connection("/cmd_drive", "my_msgs/msg/Drive", typestore=store)
-        message = store.types["my_msgs/msg/Drive"]
+        connection = writer.add_connection("/cmd_drive", kind, typestore=store)
         for k in range(20):
-            value = message(np.array([2.0, 5.0], dtype=np.float32))
-            writer.write(connection, BEGAN_NS + k * 20_000_000, store.serialize_cdr(value, "my_msgs/msg/Drive"))
+            writer.write(connection, BEGAN_NS + k * 20_000_000, raw)
     return path
 
 
 @pytest.mark.parametrize("storage", [StoragePlugin.MCAP, StoragePlugin.SQLITE3])
 def test_a_type_that_the_bag_defines_is_read(tmp_path, storage):
     drive = read_rosbag(custom(tmp_path / "b", storage), robot_config())
-    assert drive.commands.left_rad_s[0] == 2.0
-    assert drive.commands.right_rad_s[0] == 5.0
+    assert (drive.commands.left_rad_s[0], drive.commands.right_rad_s[0]) == (2.0, 5.0)
 
 
 def test_a_type_that_nobody_knows_is_named(tmp_path):
@@ -292,7 +276,7 @@ def test_a_type_that_nobody_knows_is_named(tmp_path):
     with apsw.Connection(str(file_of(folder))) as database:
         database.execute("DELETE FROM message_definitions")
     with pytest.raises(LogError, match=r"/cmd_drive: its type my_msgs/msg/Drive is not of ROS and the bag does not"):
-        read_rosbag(folder, msgspec.structs.replace(robot_config(), ros2=Ros2(command_topic="/cmd_drive")))
+        read_rosbag(folder, config(command_topic="/cmd_drive"))
 
 
 @pytest.mark.parametrize(
@@ -300,7 +284,7 @@ def test_a_type_that_nobody_knows_is_named(tmp_path):
     [None, "rosbag2_bagfile_information:\n  version: 5\n", "rosbag2_bagfile_information: [", "", "\0\0"],
     ids=["none", "no files", "not YAML", "empty", "zeros"],
 )
-def test_a_folder_whose_metadata_is_missing_or_wrong_is_read_by_its_files(tmp_path, metadata):
+def test_a_folder_whose_metadata_is_missing_or_wrong_is_read_by_its_files(tmp_path, robot, metadata):
     folder = small(tmp_path / "b")
     (folder / "metadata.yaml").unlink()
     if metadata is not None:
@@ -308,8 +292,6 @@ def test_a_folder_whose_metadata_is_missing_or_wrong_is_read_by_its_files(tmp_pa
     drive = read_rosbag(folder, robot_config())
     assert drive.wheels.t_s.size == 50
     assert "b: read by its files (b.mcap), as " in drive.notes[0]
-    robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT)
     assert import_log(folder, robot, tmp_path / "log.mcap").duration_s == pytest.approx(0.98, abs=0.01)
 
 
@@ -348,17 +330,11 @@ def test_a_pipe_in_a_bags_folder_holds_nobody_up(tmp_path):
 
 
 @pytest.mark.thorough
-def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path):
-    robot = tmp_path / "robot.toml"
-    robot.write_text(ROBOT)
+def test_a_command_on_what_is_no_bag_exits_with_two(tmp_path, robot):
     for name, content in (("a.db3", b"SQLite format 3\0rubbish"), ("a.mcap", b"\x89MCAP0\r\n\x01"), ("d", None)):
         path = tmp_path / name
         path.mkdir() if content is None else path.write_bytes(content)
-        command = [sys.executable, "-m", "disco_hw", "import", str(path), "--robot", str(robot), "-o", "o.mcap"]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
-        assert done.returncode == 2
-        assert str(path) in done.stderr.replace("\n", "")
-        assert "Traceback" not in done.stderr
+        assert str(path) in refusal_of_import(path, robot).replace("\n", "")
 
 
 def test_the_library_is_loaded_only_when_a_bag_is_read():

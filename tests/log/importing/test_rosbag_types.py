@@ -1,18 +1,16 @@
 """Hostile message definitions in a bag: those that nobody needs are not parsed, the needed ones in bounded time."""
 
-import msgspec
 import pytest
 
 from tests.tables import thinned
 
 pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
 
-from disco_hw.config import Ros2
 from disco_hw.errors import LogError
 from disco_hw.log.importing import rosbag_types
 from disco_hw.log.importing.rosbag import read_rosbag
 from tests.inference.drives import robot_config
-from tests.log.importing.bags import BEGAN_NS, bag
+from tests.log.importing.bags import BEGAN_NS, bag, config
 
 IDL_HEAD = "=" * 80 + "\nIDL: "
 NESTED = "module a_msgs { module msg { const long X = " + "(" * 4 + "1" + ")" * 4 + "; struct Drive { long y; }; }; };"
@@ -65,6 +63,5 @@ def test_needed_definitions_of_a_bag_are_given_up_after_half_a_second_together(t
 def test_a_topic_that_was_asked_for_and_takes_too_long_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(rosbag_types, "PARSE_LIMIT_S", 0.1)
     path = record_with_topics(tmp_path / "b", ["a_msgs/msg/Drive"], HOSTILE["nested brackets"])
-    config = msgspec.structs.replace(robot_config(), ros2=Ros2(command_topic="/cmd_drive0"))
     with pytest.raises(LogError, match=r"/cmd_drive0: the bag's definition of a_msgs/msg/Drive takes over 0\.1 s"):
-        read_rosbag(path, config)
+        read_rosbag(path, config(command_topic="/cmd_drive0"))

@@ -20,18 +20,19 @@ def parts(drive):
 
 def in_two_segments(drive):
     """The second half of the drive is another segment."""
-
-    def cut(part):
-        fields = {name: getattr(part, name) for name in part.__slots__}
-        return type(part)(**(fields | {"segment": (part.t_s > 6.0).astype(np.int64)}))
-
-    values = [cut(getattr(drive, name)) for name in ("commands", "wheels", "poses", "gyro")]
-    return type(drive)(drive.sources, *values, drive.notes)
+    parts = {name: getattr(drive, name) for name in ("commands", "wheels", "poses", "gyro")}
+    return replace(
+        drive, **{name: replace(part, segment=(part.t_s > 6.0).astype(np.int64)) for name, part in parts.items()}
+    )
 
 
-def test_what_is_written_is_read_back(tmp_path):
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "log.mcap"
+
+
+def test_what_is_written_is_read_back(path):
     drive = in_two_segments(logged("poor"))
-    path = tmp_path / "log.mcap"
     count = write_log(drive, path, "test")
     back = load_drive(path)
     assert count == drive.commands.t_s.size + drive.wheels.t_s.size + drive.poses.t_s.size
@@ -44,31 +45,26 @@ def test_what_is_written_is_read_back(tmp_path):
             assert np.array_equal(read, written, equal_nan=True), name
 
 
-def test_a_log_is_never_overwritten(tmp_path):
-    path = tmp_path / "log.mcap"
+def test_a_log_is_never_overwritten_and_a_place_that_is_none_refused(path):
     path.write_bytes(b"precious")
     with pytest.raises(LogError, match="already exists; give another name"):
         write_log(logged("poor"), path, "test")
     assert path.read_bytes() == b"precious"
-
-
-def test_a_place_that_is_none_is_refused(tmp_path):
     with pytest.raises(LogError, match="cannot be created"):
-        write_log(logged("poor"), tmp_path / "nowhere" / "log.mcap", "test")
+        write_log(logged("poor"), path.parent / "nowhere" / "log.mcap", "test")
 
 
-def test_times_that_do_not_fit_into_a_log_are_refused_and_leave_nothing_behind(tmp_path):
+def test_times_that_do_not_fit_into_a_log_are_refused_and_leave_nothing_behind(path):
     drive = logged("poor")
-    t_s = drive.commands.t_s.copy()
-    t_s[-1] = 1e12
+    t_s = np.append(drive.commands.t_s[:-1], 1e12)
     far = replace(drive, commands=replace(drive.commands, t_s=t_s))
     with pytest.raises(LogError, match=r"its times span 1e\+12 s; correct the clock that jumps"):
-        write_log(far, tmp_path / "log.mcap", "test")
-    assert not (tmp_path / "log.mcap").exists()
+        write_log(far, path, "test")
+    assert not path.exists()
 
 
-def test_a_full_disk_leaves_no_half_log_behind(tmp_path):
+def test_a_full_disk_leaves_no_half_log_behind(path):
     drive = logged("poor")
     with files_of_at_most(20_000), pytest.raises(LogError, match="File too large"):
-        write_log(drive, tmp_path / "log.mcap", "test")
-    assert not (tmp_path / "log.mcap").exists()
+        write_log(drive, path, "test")
+    assert not path.exists()
