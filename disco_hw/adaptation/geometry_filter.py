@@ -291,6 +291,11 @@ class GeometryFilter:
         return np.asarray(0.5 * (found + found.T))
 
     @property
+    def misfit(self) -> float:
+        """Ratio of squared innovations to expected ones, of single poses or of sums, the larger one; 1 if they fit."""
+        return max(self.innovation_ratio, self._run_innovation_ratio)
+
+    @property
     def _variance_scale(self) -> float:
         """Ratio of the innovations' variance to the expected one, of single poses or of sums of them; at least 1."""
         return max(self.innovation_ratio, self._run_innovation_ratio**2, 1.0)

@@ -75,7 +75,6 @@ class Refinement:
         self._last: Array | None = None
         self._last_ns = 0
         self._progress = CoveredWay(self._horizon_s)
-        self._lagging = LaggingRate()
         self._buffers: Buffers | None = None
 
     @property
@@ -97,7 +96,6 @@ class Refinement:
         self._last = None
         self._found[:] = 1.0
         self._progress.reset()
-        self._lagging.reset()
 
     def set_model(self, model: Model, chassis: SteeredChassis) -> None:
         """Refine in the mean of this model's belief from now on."""
@@ -176,10 +174,7 @@ class Refinement:
         end_weight = max(END_X_ICR * behind_m * self._rows.size / max(way_m, 1e-3), 1.0)
         change_m = ACCELERATION_M / self._step_s
         change = min(self._limits.acceleration_rad_s2 * self._step_s, 4.0 * self._limits.speed_rad_s)
-        left, right = begin.state[3:].tolist()
-        rate_rad_s = self._chassis.wheel_radius_m * (right - left) / self._chassis.axial_distance_m
-        lagging_rad_s = self._lagging.after(begin.t0_ns, rate_rad_s, begin.lateral_lag_s)
-        lateral = LateralLag.of(lagging_rad_s, begin.lateral_lag_s, self._step_s)
+        lateral = LateralLag.of(begin.lateral_lag_s, self._step_s)
         return Problem(
             self._start, float(begin.elapsed_s), np.array(begin.drift, np.float64), lateral, begin.mean_means,
             self._base, self._effects, self._series, self._history, self._reference,
@@ -215,25 +210,6 @@ def drift_correction(line_m: NDArray[np.float32], step_m: float, carried_m: comp
         stable_yaw(np.unwrap(np.angle(one)), np.abs(one), x_icr_m, closed=False)[0] for one in (own, ways)
     )
     return cmath.rect(1.0, with_ground - without)
-
-
-class LaggingRate:
-    """The yaw rate that the body's sideways speed goes with, which lags behind that of the wheels."""
-
-    def __init__(self) -> None:
-        self._rate_rad_s: float | None = None
-        self._ns = 0
-
-    def reset(self) -> None:
-        """Begin with the wheels' yaw rate at the next call."""
-        self._rate_rad_s = None
-
-    def after(self, now_ns: int, rate_rad_s: float, lag_s: float) -> float:
-        """Return it at `now_ns`, of wheels that turn the robot at `rate_rad_s` since the last call."""
-        before = self._rate_rad_s
-        share = -math.expm1(-(now_ns - self._ns) * 1e-9 / lag_s) if lag_s > 0.0 else 1.0
-        self._rate_rad_s, self._ns = rate_rad_s if before is None else before + share * (rate_rad_s - before), now_ns
-        return self._rate_rad_s
 
 
 class CoveredWay:

@@ -38,19 +38,18 @@ Array = NDArray[Any]
 class LateralLag(NamedTuple):
     """Lag of a body's sideways speed behind its turning, in steps that all last as long.
 
-    `rate_rad_s`: the yaw rate that the sideways speed goes with at the start. In a step it comes nearer to that of the
-    wheels by `share`, and until then the body misses a way aside as long as it slides in `missing_s` at the difference.
+    At the start it goes with the turning. In a step the yaw rate that it goes with comes nearer to the wheels' by
+    `share`, and the body misses a way aside as long as it slides in `missing_s` at the difference.
     """
 
-    rate_rad_s: float
     share: float
     missing_s: float
 
     @classmethod
-    def of(cls, rate_rad_s: float, lag_s: float, step_s: float) -> LateralLag:
+    def of(cls, lag_s: float, step_s: float) -> LateralLag:
         """Return the lag of `lag_s`, of which none is 0."""
         share = -math.expm1(-step_s / lag_s) if lag_s > 0.0 else 1.0
-        return cls(float(rate_rad_s), share, lag_s * share)
+        return cls(share, lag_s * share)
 
 
 class Problem(NamedTuple):
@@ -110,13 +109,13 @@ class Buffers(NamedTuple):
 
 
 @block_function
-def _begin(states: Array, start: Array, lateral: LateralLag, base: Base) -> None:
+def _begin(states: Array, start: Array, base: Base) -> None:
     """Set row 0 of the states to the start."""
     cos_yaw, sin_yaw = math.cos(start[2]), math.sin(start[2])
     states[0, AXLE_X], states[0, AXLE_Y] = axle_of(start[0], start[1], cos_yaw, sin_yaw, base)
     states[0, COS], states[0, SIN] = cos_yaw, sin_yaw
     states[0, LEFT], states[0, RIGHT], states[0, CARRIED] = start[3], start[4], 0.0
-    states[0, LAGGING] = lateral.rate_rad_s
+    states[0, LAGGING] = 2.0 * base.half_turn_ratio * (start[4] - start[3])
 
 
 @block_function
@@ -185,7 +184,7 @@ def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
     states, history = buffers.states, problem.history
     base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
     _store_memory(buffers.remembered, problem.means)
-    _begin(states, problem.start, problem.lateral, base)
+    _begin(states, problem.start, base)
     _roll(
         states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
         integration,
@@ -214,7 +213,7 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     normal, gradient, slopes, residuals = buffers.normal, buffers.gradient, buffers.slopes, buffers.residuals
     base, effects = base_point(problem.base, 0), effect_point(problem.effects, 0)
     _store_memory(buffers.remembered, problem.means)
-    _begin(states, problem.start, problem.lateral, base)
+    _begin(states, problem.start, base)
     _roll(
         states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
         integration,

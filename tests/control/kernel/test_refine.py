@@ -18,11 +18,11 @@ STEP_S, STEPS = 0.1, 15
 RADIUS_M, AXLE_M, X_ICR_M = 0.06, 0.4, 0.25
 
 
-def integrated(commands, lag_s, rate_rad_s):
+def integrated(commands, lag_s):
     """Places (N + 1, 2) of a robot whose wheels obey at once and whose sideways speed comes `lag_s` later."""
     fine_s = 1e-4
     x = y = yaw = 0.0
-    side_m_s, places = -X_ICR_M * rate_rad_s, [(0.0, 0.0)]
+    side_m_s, places = -X_ICR_M * RADIUS_M * (commands[0, 1] - commands[0, 0]) / AXLE_M, [(0.0, 0.0)]
     for left, right in commands:
         forward_m_s, turn_rad_s = 0.5 * RADIUS_M * (left + right), RADIUS_M * (right - left) / AXLE_M
         for _ in range(round(STEP_S / fine_s)):
@@ -52,7 +52,7 @@ def test_a_body_slides_late_behind_its_turning(lag_s):
         refine(problem, buffers, 1, 0)
         return buffers.states[:, [X, Y]].copy()
 
-    expected = integrated(commands, lag_s, 0.3)
-    assert rolled_out(LateralLag.of(0.3, lag_s, STEP_S))[1:] == pytest.approx(expected[1:], abs=3e-4)
-    at_once = rolled_out(LateralLag.of(0.3, 0.0, STEP_S))
+    expected = integrated(commands, lag_s)
+    assert rolled_out(LateralLag.of(lag_s, STEP_S))[1:] == pytest.approx(expected[1:], abs=3e-4)
+    at_once = rolled_out(LateralLag.of(0.0, STEP_S))
     assert np.abs(at_once[1:] - expected[1:]).max() > 0.1 * lag_s * X_ICR_M
