@@ -22,14 +22,14 @@ from disco_hw.model.drift import NO_DRIFT, Drift
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 6, 4, 5
+PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 6, 6, 5
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
 1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
 weights, and shorter steps below 0.2 m/s. 4: along a line of way-points tabulated twice as finely. 5: against the ground
-that carries the robot, where the log's beliefs say so. 6: with the lag of the body's sideways speed, where they say so;
-`control.disturbance` is not followed any more. Logs since `SAME_SINCE_VERSION` are replayed alike, but for those that
-followed it, up to `DISTURBANCE_UNTIL_VERSION`.
+that carries the robot, where the log's beliefs say so. 6: with the lag of the body's sideways speed, where they say so,
+another weight of the end, and tables of long paths as fine as those of short ones; `control.disturbance`, followed up
+to `DISTURBANCE_UNTIL_VERSION`, does nothing. Logs since `SAME_SINCE_VERSION` are replayed alike.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter

@@ -106,6 +106,41 @@ def learning(apply_geometry, spoil=lambda adaptation: None):
     return adaptation, written
 
 
+def test_while_poses_and_wheels_disagree_what_was_learnt_before_is_in_force():
+    in_force, told, written = [], [], []
+    adaptation = FastAdaptation(MODEL, 0.5 * MEAN, 1.6 * MEAN, in_force.append)
+    robot = robots(8001, 1)[0]
+    plant = ForeignPlant(robot, (0.0, 0.0, 0.3), 1)
+    truth = np.array([robot.x_icr_m, robot.radius_m, robot.axle_m])
+
+    def drive_on(seconds, stamped_late_ns):
+        told.clear()
+        for _ in range(round(seconds / 0.02)):
+            readings = plant.readings()
+            poses = tuple(structs.replace(pose, t_ns=pose.t_ns + stamped_late_ns) for pose in readings.poses)
+            adaptation.feed(plant.now_ns, structs.replace(readings, poses=poses))
+            update = adaptation.step(plant.now_ns)
+            told.extend(update.events)
+            written.extend(update.records)
+            plant.advance(*((2.6, 4.6) if plant.now_ms // 2000 % 2 else (4.6, 2.6)), 20)
+
+    drive_on(10.0, 0)
+    assert in_force[-1].mean == pytest.approx(truth, rel=0.05)
+    drive_on(15.0, 300_000_000)
+    assert sum("poses and wheels differ by" in event for event in told) == 1
+    (refused,) = (one for one in written if isinstance(one, Adaptation))
+    assert refused.outcome == "refused"
+    assert "check the pose source's delay" in refused.text
+    last = [one for one in written if isinstance(one, BeliefChange)][-1]
+    assert last.mean == pytest.approx(truth, rel=0.05)
+    assert in_force[-1].mean.tolist() == list(last.mean)
+    assert adaptation.status()["mean"]["wheel_radius_m"] == last.mean[1]
+    assert adaptation.status()["misfit"] > 3.0
+    drive_on(40.0, 0)
+    assert "adapt: poses and wheels agree again; learning goes on" in told
+    assert in_force[-1].mean == pytest.approx(truth, rel=0.05)
+
+
 def test_a_belief_that_the_planner_refuses_is_counted_and_not_in_force():
     def refuse(geometry):
         raise ValueError("too fast a turn")

@@ -21,8 +21,6 @@ from drivers.samples import FARTHEST_M
 # Chosen: smaller follows corners more closely, which refined plans are exact enough for, and makes the table longer.
 SPACING_M = 0.02
 REFINED_SPACING_M = 0.01
-# Chosen: longer paths are as coarse as ever. Nothing needs that any more but the replay of logs of such paths.
-MOST_REFINED = 5000
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01
 LOOK_BACK_M = 0.3
@@ -144,15 +142,8 @@ class PathTable:
 
 
 def planned_table(points: Sequence[Point], mode: str) -> PathTable:
-    """Return the table that the planner of a control mode follows: a finer one where plans are refined.
-
-    Of a path longer than MOST_REFINED times REFINED_SPACING_M it is coarser again.
-    """
-    places = np.array(points)
-    if mode != "default":
-        return PathTable(places)
-    length_m = float(np.hypot(*np.diff(places, axis=0).T).sum())
-    return PathTable(places, min(max(REFINED_SPACING_M, length_m / MOST_REFINED), SPACING_M))
+    """Return the table that the planner of a control mode follows: a finer one where plans are refined."""
+    return PathTable(np.array(points), REFINED_SPACING_M if mode == "default" else SPACING_M)
 
 
 def _rounded(points: Array, closed: bool) -> Array:
