@@ -72,14 +72,14 @@ class FastAdaptation:
             self._next_ns = now_ns if self._next_ns is None else self._next_ns
             return AdaptationUpdate()
         self._next_ns = now_ns + round(PERIOD_S * 1e9)
-        events = self._new_messages()
         filtered = self._filter
         moved = filtered.poses > max(self._poses, LEAST_POSES)
         self._poses = filtered.poses
         covariance = filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)]
         geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s, filtered.lateral_lag_s)
         written, told = self._follow_misfit(now_ns)
-        events = (*events, *told)
+        # What it makes of poses that disagree with the wheels is not told.
+        events = told if self._distrusts else (*told, *self._new_messages())
         if self._distrusts or not moved or not self._is_significant(geometry):
             return AdaptationUpdate(written, events)
         fault = geometry_fault(geometry, self._low, self._high)

@@ -33,6 +33,8 @@ MISSING_RAD = 0.08
 SHORTEST_NS = 300_000_000
 """A wheel may stand for less against a stone."""
 LONGEST_NS = 400_000_000
+# Chosen: an encoder too coarse for its robot looks so several times a second.
+TOLD_AGAIN_NS = 5_000_000_000
 """So long after the first sign at most is waited for poses that tell the cause; not with a controller that stops
 by a ramp of its own, which takes longer.
 """
@@ -140,6 +142,7 @@ class _Wheel:
     followed_rad: float = 0.0
     direction: float = 1.0
     is_reported: bool = False
+    told_ns: int | None = None
 
     def rest(self) -> None:
         """Clear what is expected of the wheel, because nothing is commanded."""
@@ -283,7 +286,7 @@ class WheelFaults:
         events: list[str] = []
         for sample in wheels:
             self._handle(sample)
-            events += self._begun()
+            events += self._begun(sample.t_ns)
         self.events = tuple(events)
         if not self._commands or now_ns - self._commands[0][0] < DELAY_NS // 2:
             return None
@@ -308,13 +311,16 @@ class WheelFaults:
             if sent and math.isfinite(turned):
                 wheel.step(sample.t_ns, dt_s, turned, [commanded[side] for _, commanded in sent])
 
-    def _begun(self) -> list[str]:
-        """Words for each wheel that begins not to follow."""
+    def _begun(self, t_ns: int) -> list[str]:
+        """Words for each wheel that begins not to follow, and of which nothing was said for a while."""
         messages = []
         for wheel, name in zip(self._wheels, _SIDES, strict=True):
             if wheel.is_suspect and not wheel.is_reported:
                 wheel.is_reported = True
                 self.not_following += 1
+                if wheel.told_ns is not None and t_ns - wheel.told_ns < TOLD_AGAIN_NS:
+                    continue
+                wheel.told_ns = t_ns
                 commanded = self._commands[-1][1][_SIDES.index(name)].slowest
                 messages.append(
                     f"the {name} wheel does not follow its command: {wheel.speed_rad_s:.1f} rad/s, commanded "

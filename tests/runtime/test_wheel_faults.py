@@ -179,6 +179,25 @@ def test_a_wheel_that_stands_against_a_stone_for_up_to_a_quarter_second_is_count
     assert robot.faults.not_following == 1
 
 
+def test_a_wheel_that_is_held_up_again_and_again_is_told_of_every_five_seconds():
+    robot = Robot()
+    robot.drive(3.0, (3.0, 3.0))
+    told = []
+    step = robot.faults.step
+
+    def listening(*given):
+        found = step(*given)
+        told.extend(robot.faults.events)
+        return found
+
+    robot.faults.step = listening
+    for _ in range(14):
+        robot.drive(0.2, (3.0, 3.0), lambda target: 0.0)
+        assert robot.drive(0.8, (3.0, 3.0)) is None
+    assert robot.faults.not_following == 14
+    assert [text.split(":")[0] for text in told] == ["the left wheel does not follow its command"] * 3
+
+
 def test_a_jump_of_the_poses_is_no_fault_of_a_wheel():
     robot = Robot(stiction_rad_s=1.0)
     robot.drive(1.0, around(0.8))
