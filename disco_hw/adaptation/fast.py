@@ -90,6 +90,8 @@ class FastAdaptation:
                 fault = f"the planner does not accept it: {error}"
         if fault:
             self._counts["refused"] += 1
+            if fault != self._text:
+                events = (*events, f"adapt: what was learnt is not used: {fault}")
             self._text = fault
             return AdaptationUpdate((records.Adaptation(now_ns, "refused", fault),), events)
         self._in_force, self._adapted = geometry, True

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from disco_hw.tasks import RobotTask
 
 
+# Of all samples together. Chosen: some hundred times more than the planner rolls out, a tenth of a second and more.
+MOST_STEPS, USUAL_HORIZON = 20_000_000, 50
+
+
 def load_robot_config(path: Path | str) -> RobotConfig:
     """Read and validate robot.toml, and none of the files that it names.
 
@@ -227,6 +231,12 @@ def _check(path: Path, config: RobotConfig) -> None:
             f"{control.command_valid_for_s} s is shorter than 1.5 control periods",
             f"write at least {1.5 / control.rate_hz:.3f} or raise rate_hz",
         )
+    steps = control.samples * (control.horizon or USUAL_HORIZON)
+    if steps > MOST_STEPS:
+        _refuse(
+            path, "control.samples", f"{steps} steps in all samples of the horizon, which take seconds to plan",
+            f"write at most {MOST_STEPS // (control.horizon or USUAL_HORIZON)}",
+        )  # fmt: skip
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
     driver = find_driver(config.link.driver)

@@ -43,7 +43,7 @@ ACCELERATION_M = 6e-4
 # error of the heading, counts as much as over so many times x_icr more of the way. With the point ahead of the centre
 # errors of the heading die away by themselves, and the end counts as every step does. Measured at 0.1 m/s on an eight:
 # robots whose body slides late were 3.5 mm off with 5, 2.7 with 10, 2.3 with 20.
-END_X_ICR = 10.0
+END_X_ICR = 20.0
 # The robot is beside the line within this part of the way that the horizon covers, and facing within this cosine.
 LATERAL_PART, FACING = 0.3, 0.5
 # Plus so many times the drift within the horizon: sampled plans do not know of it, and stay that far from the line.

@@ -96,6 +96,7 @@ def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, fragments
         ("[task]\ncenter_x_m = 500.0\nradius_m = 338.1\n", "task.center_x_m"),
         ("[control]\nrate_hz = 20.0\ncommand_valid_for_s = 0.05\n", "control.command_valid_for_s"),
         ("[control]\ntelemetry_zero_s = 0.2\n", "control.telemetry_disarm_s"),
+        ("[control]\nsamples = 1000000\nhorizon = 500\n", "control.samples: 500000000 steps"),
         ("[control]\nseed = 9223372036854775808\n", "control.seed"),
         ('[link]\nkind = "wifi"\n', "link.kind"),
         ('[task]\nkind = "square"\n', "task"),
