@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,12 @@ SIGNIFICANT_STD, SIGNIFICANT_WIDTH = 0.1, 0.97
 """A belief goes into force when its mean or the ground's drift has moved by so many standard deviations, or its width
 by this factor."""
 LARGEST_MISFIT, AGREEING_MISFIT = 3.0, 2.0
-"""Above the first misfit of poses and wheels what was last learnt below the second is in force, until it is below the
-second again. Measured: on level, sloping and slippery ground and in MuJoCo at most 2.6, also when the robot changes;
-with poses that come 0.2 s late, step or wander by 5 cm, or are of a sensor 10 cm off, 3.5 to 15."""
+"""Poses and wheels disagree from the first misfit on until it is below the second. Measured: on level, sloping and
+slippery ground and in MuJoCo at most 2.6, also when the robot changes; with poses that come 0.2 s late, step or wander
+by 5 cm, or are of a sensor 10 cm off, 3.5 to 15."""
+TRUSTED_STD, TRUSTED_POSES = 2.0, 250
+"""While they disagree, lengths within so many standard deviations of what was believed when they last agreed are used,
+and neither another drift nor lag. After so many poses the misfit is known."""
 LEAST_POSES = 10
 """Poses taken before the first belief goes into force."""
 # The filter's order is wheel radius, axial distance, x_icr; that of NAMES begins with x_icr.
@@ -52,7 +56,7 @@ class FastAdaptation:
         self._next_ns: int | None = None
         self._poses = self._changes = self._carried = 0
         self._adapted = self._paused = self._on_slope = self._distrusts = False
-        # What was last learnt while poses and wheels agreed.
+        # What was last believed while poses and wheels agreed.
         self._trusted = model
         self._requested: str | None = None
         self._text = "nothing driven yet"
@@ -80,7 +84,10 @@ class FastAdaptation:
         written, told = self._follow_misfit(now_ns)
         # What it makes of poses that disagree with the wheels is not told.
         events = told if self._distrusts else (*told, *self._new_messages())
-        if self._distrusts or not moved or not self._is_significant(geometry):
+        if self._distrusts:
+            trusted = self._trusted
+            geometry = replace(geometry, drift_m_s=trusted.drift_m_s, lateral_lag_s=trusted.lateral_lag_s)
+        if not moved or not self._is_significant(geometry) or (self._distrusts and self._departs(geometry)):
             return AdaptationUpdate(written, events)
         fault = geometry_fault(geometry, self._low, self._high)
         if not fault:
@@ -93,13 +100,13 @@ class FastAdaptation:
             if fault != self._text:
                 events = (*events, f"adapt: what was learnt is not used: {fault}")
             self._text = fault
-            return AdaptationUpdate((records.Adaptation(now_ns, "refused", fault),), events)
+            return AdaptationUpdate((*written, records.Adaptation(now_ns, "refused", fault)), events)
         self._in_force, self._adapted = geometry, True
-        if filtered.misfit < AGREEING_MISFIT:
+        if filtered.misfit < AGREEING_MISFIT and filtered.poses > TRUSTED_POSES:
             self._trusted = geometry
         self._counts["published"] += 1
         self._text = f"learnt from {filtered.poses} poses"
-        return AdaptationUpdate((change_record(now_ns, "adapted", geometry, self._text),), events)
+        return AdaptationUpdate((*written, change_record(now_ns, "adapted", geometry, self._text)), events)
 
     def feed(self, now_ns: int, readings: Readings) -> None:
         """Take in the wheel and pose samples that the tick received."""
@@ -145,25 +152,30 @@ class FastAdaptation:
             or lags_s > SIGNIFICANT_STD * self._filter.lateral_lag_std_s
         )
 
+    def _departs(self, geometry: Geometry) -> bool:
+        """Whether a length is further from what was believed when poses and wheels agreed than that allows."""
+        return bool((np.abs(geometry.mean - self._trusted.mean) > TRUSTED_STD * self._trusted.std).any())
+
     def _follow_misfit(self, now_ns: int) -> tuple[tuple[records.Record, ...], tuple[str, ...]]:
-        """Return to what was trusted where poses and wheels disagree; returns records and events of a change."""
+        """Return to what is trusted when poses and wheels begin to disagree; returns records and events."""
         misfit, distrusted = self._filter.misfit, self._distrusts
         self._distrusts = misfit > (AGREEING_MISFIT if distrusted else LARGEST_MISFIT)
         if self._distrusts == distrusted:
             return (), ()
         if distrusted:
-            return (), ("adapt: poses and wheels agree again; learning goes on",)
+            return (), ("adapt: poses and wheels agree again",)
         self._text = (
-            f"poses and wheels differ by {math.sqrt(misfit):.1f} times what their noise explains; what was learnt "
-            "before is used until they agree; check the pose source's delay and place on the robot"
+            f"poses and wheels differ by {math.sqrt(misfit):.1f} times what their noise explains; until they agree, "
+            "only lengths near those believed before are used; check the pose source's delay, noise and place"
         )
         self._counts["refused"] += 1
         written: list[records.Record] = [records.Adaptation(now_ns, "refused", self._text)]
-        if self._in_force is not self._trusted:
-            trusted = None if self._trusted is self._model else self._trusted
-            self._apply_geometry(trusted)
-            self._in_force, self._adapted = self._trusted, trusted is not None
-            written.append(change_record(now_ns, "model" if trusted is None else "adapted", trusted, self._text))
+        trusted = self._trusted
+        if self._departs(self._in_force) or self._in_force.drift_m_s != trusted.drift_m_s:
+            found = None if trusted is self._model else trusted
+            self._apply_geometry(found)
+            self._in_force, self._adapted = trusted, found is not None
+            written.append(change_record(now_ns, "model" if found is None else "adapted", found, self._text))
         return tuple(written), (f"adapt: {self._text}",)
 
     def _new_messages(self) -> tuple[str, ...]:
