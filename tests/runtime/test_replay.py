@@ -14,6 +14,7 @@ from disco_hw.control.past_motion import DriveMeans
 from disco_hw.control.plan import DISTURBANCE_UNTIL_VERSION, PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
+from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Plan
 from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
@@ -176,6 +177,16 @@ def test_plans_that_were_refined_otherwise_are_refused_and_a_log_without_plans_i
 def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
     with pytest.raises(InputError, match="holds no ticks"):
         replay(write_log(tmp_path / "empty.mcap", []))
+    log = write_log(tmp_path / "damaged.mcap", ticks[:3])
+    damaged = bytearray(log.read_bytes()[:-40])
+    with open_log(log) as read:
+        for chunk in read._contents.chunks:
+            damaged[chunk.offset + 100] ^= 0xFF
+    log.write_bytes(damaged)
+    with pytest.raises(
+        InputError, match=r"holds no ticks that can be read: at byte \d+: a chunk .* bytes are lost"
+    ):
+        replay(log)
     with pytest.raises(InputError, match=r"carries no robot\.toml"):
         replay(write_ticks(tmp_path / "bare.mcap", ticks[:1]))
     odd = write_log(tmp_path / "odd.mcap", ticks[:1], model="format = 7\n")
