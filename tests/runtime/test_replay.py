@@ -183,9 +183,7 @@ def test_a_log_without_ticks_or_robot_is_refused(tmp_path, ticks):
         for chunk in read._contents.chunks:
             damaged[chunk.offset + 100] ^= 0xFF
     log.write_bytes(damaged)
-    with pytest.raises(
-        InputError, match=r"holds no ticks that can be read: at byte \d+: a chunk .* bytes are lost"
-    ):
+    with pytest.raises(InputError, match=r"holds no ticks that can be read: at byte \d+: a chunk .* bytes are lost"):
         replay(log)
     with pytest.raises(InputError, match=r"carries no robot\.toml"):
         replay(write_ticks(tmp_path / "bare.mcap", ticks[:1]))
