@@ -80,7 +80,9 @@ class FastAdaptation:
         moved = filtered.poses > max(self._poses, LEAST_POSES)
         self._poses = filtered.poses
         covariance = filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)]
-        geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s, filtered.lateral_lag_s)
+        # What it lags for sure: a plan that counts on too long a lag is further from the line than one that knows of none.
+        sure_lag_s = max(filtered.lateral_lag_s - filtered.lateral_lag_std_s, 0.0)
+        geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s, sure_lag_s)
         written, told = self._follow_misfit(now_ns)
         # What it makes of poses that disagree with the wheels is not told.
         events = told if self._distrusts else (*told, *self._new_messages())
