@@ -80,7 +80,7 @@ class FastAdaptation:
         moved = filtered.poses > max(self._poses, LEAST_POSES)
         self._poses = filtered.poses
         covariance = filtered.covariance[np.ix_(_TO_NAMES, _TO_NAMES)]
-        # What it lags for sure: a plan that counts on too long a lag is further from the line than one that knows of none.
+        # What it lags for sure: plans that count on too long a lag stay further from the line than those without.
         sure_lag_s = max(filtered.lateral_lag_s - filtered.lateral_lag_std_s, 0.0)
         geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s, sure_lag_s)
         written, told = self._follow_misfit(now_ns)
