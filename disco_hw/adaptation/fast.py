@@ -24,13 +24,13 @@ PERIOD_S = 0.5
 SIGNIFICANT_STD, SIGNIFICANT_WIDTH = 0.1, 0.97
 """A belief goes into force when its mean or the ground's drift has moved by so many standard deviations, or its width
 by this factor."""
-LARGEST_MISFIT, AGREEING_MISFIT = 3.0, 2.0
-"""Poses and wheels disagree from the first misfit on until it is below the second. Measured: on level, sloping and
+LARGEST_MISMATCH, AGREEING_MISMATCH = 3.0, 2.0
+"""Poses and wheels disagree from the first mismatch (see `GeometryFilter`) on until it is below the second. Measured: on level, sloping and
 slippery ground and in MuJoCo at most 2.6, also when the robot changes; with poses that come 0.2 s late, step or wander
 by 5 cm, or are of a sensor 10 cm off, 3.5 to 15."""
 TRUSTED_STD, TRUSTED_POSES = 2.0, 250
 """While they disagree, lengths within so many standard deviations of what was believed when they last agreed are used,
-and neither another drift nor lag. After so many poses the misfit is known."""
+and neither another drift nor lag. After so many poses the mismatch is known."""
 LEAST_POSES = 10
 """Poses taken before the first belief goes into force."""
 # The filter's order is wheel radius, axial distance, x_icr; that of NAMES begins with x_icr.
@@ -83,9 +83,9 @@ class FastAdaptation:
         # What it lags for sure: plans that count on too long a lag stay further from the line than those without.
         sure_lag_s = max(filtered.lateral_lag_s - filtered.lateral_lag_std_s, 0.0)
         geometry = Geometry(filtered.mean[_TO_NAMES], covariance, filtered.drift_m_s, sure_lag_s)
-        written, told = self._follow_misfit(now_ns)
-        # What it makes of poses that disagree with the wheels is not told.
-        events = told if self._distrusts else (*told, *self._new_messages())
+        written, events = self._follow_mismatch(now_ns)
+        # What it makes of poses that disagree with the wheels is not reported.
+        events = events if self._distrusts else (*events, *self._new_messages())
         if self._distrusts:
             trusted = self._trusted
             geometry = replace(geometry, drift_m_s=trusted.drift_m_s, lateral_lag_s=trusted.lateral_lag_s)
@@ -104,7 +104,7 @@ class FastAdaptation:
             self._text = fault
             return AdaptationUpdate((*written, records.Adaptation(now_ns, "refused", fault)), events)
         self._in_force, self._adapted = geometry, True
-        if filtered.misfit < AGREEING_MISFIT and filtered.poses > TRUSTED_POSES:
+        if filtered.mismatch < AGREEING_MISMATCH and filtered.poses > TRUSTED_POSES:
             self._trusted = geometry
         self._counts["published"] += 1
         self._text = f"learnt from {filtered.poses} poses"
@@ -133,7 +133,7 @@ class FastAdaptation:
             "covariance": self._in_force.covariance.ravel().tolist(),
             "drift_m_s": list(self._in_force.drift_m_s),
             "lateral_lag_s": self._in_force.lateral_lag_s,
-            "misfit": self._filter.misfit,
+            "misfit": self._filter.mismatch,
             **self._counts,
         }
 
@@ -158,16 +158,16 @@ class FastAdaptation:
         """Whether a length is further from what was believed when poses and wheels agreed than that allows."""
         return bool((np.abs(geometry.mean - self._trusted.mean) > TRUSTED_STD * self._trusted.std).any())
 
-    def _follow_misfit(self, now_ns: int) -> tuple[tuple[records.Record, ...], tuple[str, ...]]:
+    def _follow_mismatch(self, now_ns: int) -> tuple[tuple[records.Record, ...], tuple[str, ...]]:
         """Return to what is trusted when poses and wheels begin to disagree; returns records and events."""
-        misfit, distrusted = self._filter.misfit, self._distrusts
-        self._distrusts = misfit > (AGREEING_MISFIT if distrusted else LARGEST_MISFIT)
+        mismatch, distrusted = self._filter.mismatch, self._distrusts
+        self._distrusts = mismatch > (AGREEING_MISMATCH if distrusted else LARGEST_MISMATCH)
         if self._distrusts == distrusted:
             return (), ()
         if distrusted:
             return (), ("adapt: poses and wheels agree again",)
         self._text = (
-            f"poses and wheels differ by {math.sqrt(misfit):.1f} times what their noise explains; until they agree, "
+            f"poses and wheels differ by {math.sqrt(mismatch):.1f} times what their noise explains; until they agree, "
             "only lengths near those believed before are used; check the pose source's delay, noise and place"
         )
         self._counts["refused"] += 1

@@ -291,7 +291,7 @@ class GeometryFilter:
         return np.asarray(0.5 * (found + found.T))
 
     @property
-    def misfit(self) -> float:
+    def mismatch(self) -> float:
         """Ratio of squared innovations to expected ones, of single poses or of sums, the larger one; 1 if they fit."""
         return max(self.innovation_ratio, self._run_innovation_ratio)
 

@@ -103,7 +103,7 @@ class Refinement:
         self._chassis = chassis
         self._base, self._effects = coefficient_tables(model, mean_point(model), self._step_s)
         if self._buffers is None:
-            self._buffers = make_buffers(self._rows.size, self._history, new_means(self._effects))
+            self._buffers = create_buffers(self._rows.size, self._history, new_means(self._effects))
 
     def improve(self, terms: Terms, start: NDArray[np.float32], begin: PlanStart, nominal: Array) -> Array | None:
         """Return commands (N, 2) that cost no more than the plan `nominal` (T, 2); None off the line.
@@ -234,7 +234,7 @@ class CoveredWay:
         return self._part
 
 
-def make_buffers(steps: int, history: int, means: Array | None) -> Buffers:
+def create_buffers(steps: int, history: int, means: Array | None) -> Buffers:
     """Return scratch for so many steps after `history` rows, for a model that remembers `means` (n,) or nothing."""
     size = CHANNELS * steps
     return Buffers(

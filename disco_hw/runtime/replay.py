@@ -145,8 +145,8 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
             if difference is not None:
                 break
         if not ticks:
-            lost = f" that can be read: {log.damage[0]}" if log.damage else ""
-            raise InputError(f"{path}: holds no ticks{lost}; give the log of a `disco-hw run`")
+            damage = f" that can be read: {log.damage[0]}" if log.damage else ""
+            raise InputError(f"{path}: holds no ticks{damage}; give the log of a `disco-hw run`")
         return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
 
 

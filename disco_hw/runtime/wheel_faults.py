@@ -34,7 +34,7 @@ SHORTEST_NS = 300_000_000
 """A wheel may stand for less against a stone."""
 LONGEST_NS = 400_000_000
 # Chosen: an encoder too coarse for its robot looks so several times a second.
-TOLD_AGAIN_NS = 5_000_000_000
+REPORTED_AGAIN_NS = 5_000_000_000
 """So long after the first sign at most is waited for poses that tell the cause; not with a controller that stops
 by a ramp of its own, which takes longer.
 """
@@ -142,7 +142,7 @@ class _Wheel:
     followed_rad: float = 0.0
     direction: float = 1.0
     is_reported: bool = False
-    told_ns: int | None = None
+    reported_ns: int | None = None
 
     def rest(self) -> None:
         """Clear what is expected of the wheel, because nothing is commanded."""
@@ -318,9 +318,9 @@ class WheelFaults:
             if wheel.is_suspect and not wheel.is_reported:
                 wheel.is_reported = True
                 self.not_following += 1
-                if wheel.told_ns is not None and t_ns - wheel.told_ns < TOLD_AGAIN_NS:
+                if wheel.reported_ns is not None and t_ns - wheel.reported_ns < REPORTED_AGAIN_NS:
                     continue
-                wheel.told_ns = t_ns
+                wheel.reported_ns = t_ns
                 commanded = self._commands[-1][1][_SIDES.index(name)].slowest
                 messages.append(
                     f"the {name} wheel does not follow its command: {wheel.speed_rad_s:.1f} rad/s, commanded "

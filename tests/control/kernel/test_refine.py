@@ -9,7 +9,7 @@ import pytest
 
 from disco_hw.control.kernel.refine import LateralLag, Problem, X, Y, refine
 from disco_hw.control.parameter_points import mean_point
-from disco_hw.control.refinement import make_buffers
+from disco_hw.control.refinement import create_buffers
 from disco_hw.model import Model
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import integration_series
@@ -40,7 +40,7 @@ def test_a_body_slides_late_behind_its_turning(lag_s):
     base, effects = coefficient_tables(model, mean_point(model), STEP_S)
     turning = 2.0 * np.sin(1.5 * STEP_S * np.arange(STEPS) + 0.4)
     commands = np.column_stack([4.0 - turning, 4.0 + turning])
-    buffers = make_buffers(STEPS, 0, None)
+    buffers = create_buffers(STEPS, 0, None)
     buffers.starts[0] = commands
 
     def rolled_out(lateral):
