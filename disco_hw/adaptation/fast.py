@@ -25,9 +25,9 @@ SIGNIFICANT_STD, SIGNIFICANT_WIDTH = 0.1, 0.97
 """A belief goes into force when its mean or the ground's drift has moved by so many standard deviations, or its width
 by this factor."""
 LARGEST_MISMATCH, AGREEING_MISMATCH = 3.0, 2.0
-"""Poses and wheels disagree from the first mismatch (see `GeometryFilter`) on until it is below the second. Measured: on level, sloping and
-slippery ground and in MuJoCo at most 2.6, also when the robot changes; with poses that come 0.2 s late, step or wander
-by 5 cm, or are of a sensor 10 cm off, 3.5 to 15."""
+"""Poses and wheels disagree from the first mismatch on until it is below the second (`GeometryFilter.mismatch`).
+Measured: on level, sloping and slippery ground and in MuJoCo at most 2.6, also when the robot changes; with poses that
+come 0.2 s late, step or wander by 5 cm, or are of a sensor 10 cm off, 3.5 to 15."""
 TRUSTED_STD, TRUSTED_POSES = 2.0, 250
 """While they disagree, lengths within so many standard deviations of what was believed when they last agreed are used,
 and neither another drift nor lag. After so many poses the mismatch is known."""
