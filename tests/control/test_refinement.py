@@ -120,6 +120,19 @@ def test_a_refined_plan_costs_no_more_than_the_sampled_one(speed_m_s: float) -> 
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize(("x_icr_m", "counts"), [(X_ICR_M, True), (-X_ICR_M, False)], ids=["behind", "ahead"])
+def test_plans_count_on_the_lag_of_the_sideways_speed_with_the_point_behind(x_icr_m: float, counts: bool) -> None:
+    """From beside the line, as on it nothing changes that could lag."""
+    plans = []
+    for lag_s in (0.0, 0.1):
+        model = Model(0.06, 0.4, x_icr_m, MODEL.effects)
+        planner = Disco(model, CircleCost(radius_m=RADIUS_M, speed_m_s=0.2), SETTINGS, LIMITS)
+        state = structs.replace(_on_the_circle(0.2), x_m=RADIUS_M + 0.02, lateral_lag_s=lag_s)
+        plans.append(planner.plan(0, state).wheel_speeds)
+    assert np.array_equal(*plans) is not counts
+
+
+@pytest.mark.thorough
 def test_warming_up_compiles_the_refinement() -> None:
     """The refinement is compiled before the robot reaches its line, though warming up plans far from it."""
     planner = Disco(MODEL, CircleCost(radius_m=RADIUS_M), SETTINGS, LIMITS)

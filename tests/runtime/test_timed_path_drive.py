@@ -19,7 +19,7 @@ from tests.runtime.simulated import recorded, replayed, write_run
 from tests.runtime.test_path_drive import drive, started
 from tests.tasks.costs import instant_cost
 
-# Half a minute of compiling; tests/control/tasks/test_timed_path.py drives such a path in every `make test`.
+# Half a minute of compiling; tests/tasks/test_timed_path.py drives such a path in every `make test`.
 pytestmark = pytest.mark.long
 
 # Straight, a rest of 2 s, and round a corner.
