@@ -265,7 +265,9 @@ def displacement(
     out = np.empty((start.size, 3))
     sensor = pose_sensor(p)
     world = np.array([sensor.delay_s - moved_s, sensor.bias_rad])
-    _displace(world, track, ground, start, low, high, heading_rad, round(ahead_s / GRID_STEP_S), out)
+    # A strided column is another type, for which it would be compiled once more.
+    heading = np.ascontiguousarray(heading_rad)
+    _displace(world, track, ground, start, low, high, heading, round(ahead_s / GRID_STEP_S), out)
     return out
 
 

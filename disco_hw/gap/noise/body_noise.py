@@ -266,10 +266,11 @@ def _whiten(
 
 
 def _along(motion: BodyMotion) -> tuple[Array | Mask, ...]:
-    """Return the motion as the tuple of arrays that the kernels take."""
+    """Return the motion as the tuple of arrays that the kernels take, none of them a strided column of a table."""
+    dx, dy = np.ascontiguousarray(motion.dx_m), np.ascontiguousarray(motion.dy_m)
     return (
-        motion.dt_s, motion.dx_m, motion.dy_m, np.cos(motion.yaw_rad), np.sin(motion.yaw_rad), motion.moving,
-        motion.speed_m_s, motion.yaw_rate_rad_s, motion.restart, motion.use,
+        motion.dt_s, dx, dy, np.cos(motion.yaw_rad), np.sin(motion.yaw_rad), motion.moving, motion.speed_m_s,
+        motion.yaw_rate_rad_s, motion.restart, motion.use,
     )  # fmt: skip
 
 
