@@ -401,7 +401,8 @@ class FreeRun:
         # Fresh copies, as a read-only array or a strided one is another type and would be compiled anew, in mid-loop.
         copied, carried = np.array(commands, dtype=np.float64, order="C"), np.array(drift)
         kept = None if not self._has_memory else new_means(self._effects) if means is None else means
-        arguments = states, copied, history, float(time_s), point, carried, kept, self._base, self._effects, self._series
+        coefficients = self._base, self._effects, self._series
+        arguments = states, copied, history, float(time_s), point, carried, kept, *coefficients
         if self._run is None:
             self._run = compiled_for(run_states, *arguments)
         self._run(*arguments)
