@@ -310,6 +310,9 @@ def imported_by(path: Path) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        elif isinstance(node, ast.Attribute) and node.attr == "iter_modules":
+            # A registry imports whatever lies in its folder.
+            found |= {module_name(each) for each in path.parent.glob("*.py")}
     return found
 
 
@@ -325,6 +328,14 @@ def touched_by(name: str) -> set[str]:
         if not more:
             return touched | {one for one in files if one.startswith("tests")}
         touched |= more
+
+
+def forget(name: str) -> None:
+    """Have a module imported anew: its package keeps it, too, and hands it to `from package import module`."""
+    sys.modules.pop(name, None)
+    package, _, own = name.rpartition(".")
+    if package in sys.modules and isinstance(getattr(sys.modules[package], own, None), ModuleType):
+        delattr(sys.modules[package], own)
 
 
 @dataclass(frozen=True)
@@ -346,11 +357,12 @@ class Trial:
             try:
                 resource.setrlimit(resource.RLIMIT_CPU, (CPU_S, CPU_S))
                 for one in self.touched:
-                    sys.modules.pop(one, None)
+                    forget(one)
                 sys.meta_path.insert(0, Mutated(self.name, self.file, mutated))
+                named = dict.fromkeys(test.partition("[")[0] if " at 0x" in test else test for test in tests)
                 # File by file, so that the others need not even be collected.
-                files = dict.fromkeys(test.partition("::")[0] for test in tests)
-                status = any(run_tests([test for test in tests if test.partition("::")[0] == one]) for one in files)
+                files = dict.fromkeys(test.partition("::")[0] for test in named)
+                status = any(run_tests([test for test in named if test.partition("::")[0] == one]) for one in files)
             finally:
                 os._exit(status)
         return os.waitpid(process, 0)[1] != 0

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from tools.python_mutants import EQUIVALENTS, ROOT, mutants
+from drivers.motor import find_driver
+from tests.drivers.motor import test_vendor_frames
+from tools.python_mutants import EQUIVALENTS, ROOT, Trial, module_name, mutants, touched_by
 
 
 def changes(source):
@@ -37,6 +39,21 @@ def test_a_change_of_what_runs_on_import_is_tried_with_all_tests():
     assert [(one.mutant.old, one.on_import, sorted(one.lines)) for one in placed[::2]] == [
         ("1", True, [1]), ("2", True, [3]), ("3", False, [4]), ("4", True, [8]),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("changed", "noticed"), [('"set_erpm": (4,', True), ('"set_erpm":  (3,', False)])
+def test_a_module_that_its_package_hands_out_is_tried_as_changed(tmp_path, changed, noticed):
+    """In the package's own files, which find it in their folder, and in a test that imports it from there."""
+    path = ROOT / "drivers" / "motor" / "vesc_codec.py"
+    source, name = path.read_text("utf-8"), module_name(path)
+    mutant = source.replace('"set_erpm": (3,', changed)
+    assert mutant != source
+    assert find_driver("vesc") is not None
+    touched = touched_by(name)
+    assert "drivers.motor" in touched
+    test = test_vendor_frames.test_a_command_is_the_documented_frame_held_to_what_the_wire_can_say.__name__
+    tests = [f"{ROOT / 'tests' / 'drivers' / 'motor' / 'test_vendor_frames.py'}::{test}"]
+    assert Trial(name, path, touched, tmp_path).killed(mutant, tests) is noticed
 
 
 @pytest.mark.parametrize(("name", "reasons"), tomllib.loads(EQUIVALENTS.read_text("utf-8")).items())

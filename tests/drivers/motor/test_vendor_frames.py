@@ -193,6 +193,32 @@ def test_a_vescs_fault_is_read_from_an_answer_in_fragments():
     assert vesc.values(payload) == {"fault": 5, "status_byte": vesc.TIMED_OUT}
 
 
+@pytest.mark.parametrize(
+    ("length", "kinds"), [(6, {8}), (7, {5, 7}), (259, {5, 7}), (260, {5, 6, 7}), (512, {5, 6, 7})]
+)
+def test_a_vescs_packet_comes_whole_out_of_its_fragments(length, kinds):
+    """Up to 6 bytes in one frame, then in fragments of 7 that begin before byte 255, then of 6."""
+    payload = bytes((7 * k + k // 256) % 256 for k in range(length))
+    reassembly, frames = vesc.Reassembly(200), fragments(payload)
+    assert {frame.can_id >> 8 for frame in frames} == kinds
+    assert [reassembly.feed(frame) for frame in frames] == [*[None] * (len(frames) - 1), (23, 1, payload)]
+
+
+@pytest.mark.parametrize(
+    ("length", "head"), [(1, "0201"), (255, "02ff"), (256, "030100"), (512, "030200")], ids=["1", "255", "256", "512"]
+)
+def test_a_vescs_serial_packet_says_its_length_in_as_few_bytes_as_it_can(length, head):
+    payload = bytes(range(256)) * 2
+    sent = vesc.packet(payload[:length])
+    assert sent.startswith(bytes.fromhex(head) + b"\0")
+    assert vesc.packets(b"\1" + sent + sent[:5]) == [payload[:length]]
+
+
+def test_an_answer_with_no_value_is_one_and_a_shorter_one_is_none():
+    answers = [vesc.values(bytes.fromhex(answer)) for answer in ("3200000000", "32000000", "3300000000")]
+    assert answers == [{}, None, None]
+
+
 def test_a_lost_fragment_is_no_packet():
     frames = fragments(bytes(range(1, 40)))
     reassembly = vesc.Reassembly(200)

@@ -40,6 +40,19 @@ def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(bench, pause
     assert bench.robot.speed_rad_s < 0.05
 
 
+# The vendor's documentation/comm_can.md: duty, current, brake, speed, position, shares of current and of brake, hand
+# brake and its share; a packet and a ping command nothing.
+COMMANDS = {0: True, 1: True, 3: True, 4: True, 10: True, 11: True, 12: True, 13: True, 8: False, 17: False, 26: False}
+
+
+@pytest.mark.parametrize(("number", "is_command"), COMMANDS.items())
+def test_whatever_command_another_host_sends_a_motor_is_a_fault_and_nothing_else_is(bench, number, is_command):
+    bench.drive(0.2, FORWARD)
+    bench.inject_to_host(number << 8 | 23, bytes(4), extended=True)
+    bench.run(0.05)
+    assert ("another host" in bench.driver.detail) is is_command
+
+
 def test_a_controller_that_restarts_while_armed_is_lost(bench):
     bench.drive(2.0, FORWARD)
     bench.robot.controller.restart()
