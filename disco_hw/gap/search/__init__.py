@@ -7,7 +7,7 @@ best stand-in of one channel may lead the chain from command to pose astray.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -29,8 +29,8 @@ from disco_hw.gap.search.cross_validation import (
     fold_vectors,
     scored_horizon_s,
     smoothed_poses,
-    within_one_standard_error,
 )
+from disco_hw.gap.search.decision import best_of, is_as_good
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
 from disco_hw.gap.search.richest_model import DELAY_COLUMNS, DELAY_STARTS_S, with_delay
@@ -74,9 +74,13 @@ class StagePredictions:
         """Errors by stage and horizon, with the floor, for which the wheels' path is that of the geometry alone."""
         horizons = self.body.settings.prediction.horizons_s
         table = {stage: {ahead_s: self.errors(stage, ahead_s) for ahead_s in horizons} for stage in self.chains}
-        noise = sensor_noise(self.body, with_delay(self.body, self.chains["refitted"][0].body))
-        table["floor"] = {ahead_s: floor_errors(self.body, noise, ahead_s, self.poses) for ahead_s in horizons}
+        table["floor"] = {ahead_s: self.floor(ahead_s) for ahead_s in horizons}
         return table
+
+    def floor(self, ahead_s: float) -> PredictionErrors:
+        """Errors of a perfect model so far ahead, by the sensors' noise."""
+        noise = sensor_noise(self.body, with_delay(self.body, self.chains["refitted"][0].body))
+        return floor_errors(self.body, noise, ahead_s, self.poses)
 
 
 def stage_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePredictions:
@@ -143,7 +147,7 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
-    needed = _needed(of_every_log(analysis, final), timed, ahead, apart)
+    needed = _needed(of_every_log(analysis, final), timed, ahead, apart, apart.floor(apart.scored_horizon_s))
     amended = _Fitted(needed.candidate.of, needed.fit(ahead), needed.folds)
     stages = {"refitted": refitted, "timed": timed, "amended": amended}
     chains |= {name: stage.chains for name, stage in stages.items()}
@@ -226,11 +230,6 @@ class _Evaluated:
     folds: Mapping[int, JointFit]
     errors: PredictionErrors
 
-    @property
-    def size(self) -> float:
-        """Errors of position and heading together."""
-        return self.errors.position_m * self.errors.yaw_rad
-
     def fit(self, ahead: Ahead) -> JointFit:
         """Return the best fit of all data, of those begun at the candidate's values and at each fold's fit.
 
@@ -259,30 +258,35 @@ def of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
     return analysis
 
 
-def _needed(analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
+def _needed(
+    analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions, floor: PredictionErrors | None
+) -> _Evaluated:
     """Return the candidate reduced to what predictions need of all that was found.
 
-    Effects and terms are dropped, the least evident first, where held-out errors stay within one standard error of the
-    best candidate's (Breiman et al., Classification and Regression Trees, 1984, ch. 3). What predictions do not need
-    may hold for this log only.
+    Effects and terms are dropped, the least evident first, where held-out data are predicted as well as by the best
+    candidate, by the rule of `decision.py`. What predictions do not need may hold for this log only. `floor`: errors
+    of a perfect model, by the sensors' noise.
     """
     of_channels = _Candidate.of_channels(analysis, apart)
     kept = of_channels.evaluate(ahead, apart)
     if not analysis.found_any:
         return kept
 
-    def topped(candidate: _Candidate) -> _Evaluated:
-        return min((one.evaluate(ahead, apart) for one in candidate.on_top(timed)), key=lambda one: one.size)
+    def best_of_these(options: Iterable[_Evaluated]) -> _Evaluated:
+        return best_of(tuple(options), lambda one: one.errors, floor)
 
-    kept = best = min(kept, topped(of_channels), key=lambda one: one.size)
+    def topped(candidate: _Candidate) -> _Evaluated:
+        return best_of_these(one.evaluate(ahead, apart) for one in candidate.on_top(timed))
+
+    kept = best = best_of_these((kept, topped(of_channels)))
     for which, name in least_evident_first(analysis):
         fewer = lacking(kept.candidate.analysis, which, name)
         if not fewer.found_any:
             break
         option = topped(_Candidate.of_channels(fewer, apart))
-        if within_one_standard_error(best.errors, option.errors):
+        if is_as_good(best.errors, option.errors, floor):
             kept = option
-        best = min(best, option, key=lambda one: one.size)
+        best = best_of_these((best, option))
     return kept
 
 

@@ -6,7 +6,6 @@ the heading that they make on the robot's geometry, in the units of the whole ga
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
@@ -57,18 +56,6 @@ class PredictionErrors:
 def worse_by(before: PredictionErrors, after: PredictionErrors) -> float:
     """Ratio of errors after to before, the larger one of position and heading."""
     return max(after.position_m / before.position_m, after.yaw_rad / before.yaw_rad)
-
-
-def within_one_standard_error(best: PredictionErrors, other: PredictionErrors) -> bool:
-    """Whether other errors exceed the best ones by no more than the standard error that stretches of time give it.
-
-    Squares of position and of heading count alike, each as shares of the best ones'.
-    """
-    if best.squares is None or other.squares is None:
-        return other.position_m * other.yaw_rad <= best.position_m * best.yaw_rad
-    growth = ((other.squares - best.squares) / np.maximum(best.squares.sum(axis=0), 1e-300)).sum(axis=1)
-    error = math.sqrt(growth.size) * float(growth.std(ddof=1)) if growth.size > 1 else 0.0
-    return float(growth.sum()) <= error
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Past:
         speeds = float(wheels.left_speed_rad_s[reading]), float(wheels.right_speed_rad_s[reading])
         sent = tuple(one for one in self._sent if one.t_ns <= now_ns)
         state = PlannerState(now_ns, 0.0, 0.0, 0.0, *speeds, sent=sent, body_means=self._means.body)
-        return self._motion.of_mean(state, now_ns, lambda commands: commands, speeds)
+        return self._motion.of_mean(state, now_ns)
 
 
 def errors_ahead(model: Model, log: DriveLog, remembers: bool = True) -> tuple[float, float]:

@@ -20,7 +20,6 @@ from disco_hw.gap.search.cross_validation import (
     fold_vectors,
     scored_horizon_s,
     smoothed_poses,
-    within_one_standard_error,
     worse_by,
 )
 from disco_hw.gap.search.end_to_end import Ahead
@@ -95,47 +94,3 @@ def test_the_larger_growth_of_position_and_heading_counts():
     before = errors_in_stretches([1.0] * 6, [4.0] * 6)
     assert worse_by(before, errors_in_stretches([4.0] * 6, [9.0] * 6)) == pytest.approx(2.0)
     assert worse_by(before, errors_in_stretches([1.0] * 6, [9.0] * 6)) == pytest.approx(1.5)
-
-
-@pytest.mark.parametrize(
-    ("position", "yaw", "within"),
-    [
-        # Shares by which squares grow, of which the standard error of two is their difference.
-        ((0.05, -0.0025), (0.0, 0.0), True),
-        ((0.05, 0.0025), (0.0, 0.0), False),
-        ((0.05, 0.0), (0.0, -0.04), True),
-        ((0.0, 0.05), (-0.04, 0.0), True),
-        # Squares of position are far larger, and count no more.
-        ((0.001, -0.0009), (0.0, 0.04), False),
-    ],
-)
-def test_as_good_as_the_best_is_what_exceeds_it_by_no_more_than_its_growth_scatters(position, yaw, within):
-    best = errors_in_stretches([50.0, 50.0], [0.005, 0.005])
-    other = errors_in_stretches(50.0 + 100.0 * np.array(position), 0.005 + 0.01 * np.array(yaw))
-    assert within_one_standard_error(best, other) == within
-
-
-@pytest.mark.parametrize(
-    ("squares", "within"),
-    [
-        ([1.0, 1.0, 1.0, 1.0], True),
-        ([1.3, 0.8, 1.2, 0.8], True),
-        ([1.3, 1.2, 1.1, 1.2], False),
-        # A single stretch says nothing of the scatter.
-        ([1.0], True),
-        ([1.01], False),
-    ],
-)
-def test_errors_are_as_small_as_the_best_within_what_their_difference_scatters(squares, within):
-    best, other = ([1.0] * len(squares),) * 2, (squares,) * 2
-    assert within_one_standard_error(errors_in_stretches(*best), errors_in_stretches(*other)) == within
-
-
-@pytest.mark.parametrize(
-    ("position_m", "yaw_rad", "within"), [(2.0, 1.0, True), (2.0, 1.01, False), (1.0, 2.1, False), (0.5, 3.9, True)]
-)
-def test_without_errors_by_stretch_the_best_is_what_errs_least_in_position_times_heading(position_m, yaw_rad, within):
-    best, other = errors_in_stretches([1.0] * 4, [4.0] * 4), errors_in_stretches([position_m**2] * 4, [yaw_rad**2] * 4)
-    bare = [replace(one, squares=None) for one in (best, other)]
-    for pair in ((bare[0], bare[1]), (best, bare[1]), (bare[0], other)):
-        assert within_one_standard_error(*pair) == within

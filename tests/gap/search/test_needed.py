@@ -83,7 +83,7 @@ def needed(monkeypatch, squares, wheels=None, body=None):
     monkeypatch.setattr(Candidate, "judged_so_far", [], raising=False)
     monkeypatch.setattr(stages, "_Candidate", Candidate)
     analysis = analysis_of(wheels, body)
-    kept = stages._needed(analysis, "timed", "ahead", "apart").candidate
+    kept = stages._needed(analysis, "timed", "ahead", "apart", None).candidate
     wheels, body, left_out = told(kept.analysis)
     return " ".join((*(wheels or ()), *(body or ()))), kept.is_on_top, left_out, Candidate.judged_so_far
 
