@@ -7,7 +7,7 @@ best stand-in of one channel may lead the chain from command to pose astray.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,7 +30,7 @@ from disco_hw.gap.search.cross_validation import (
     scored_horizon_s,
     smoothed_poses,
 )
-from disco_hw.gap.search.decision import best_of, is_as_good
+from disco_hw.gap.search.decision import best_of, excess
 from disco_hw.gap.search.end_to_end import Ahead, Freed, JointFit, Part
 from disco_hw.gap.search.least_squares import Fit, inverse
 from disco_hw.gap.search.richest_model import DELAY_COLUMNS, DELAY_STARTS_S, with_delay
@@ -147,7 +147,8 @@ def joint_predictions(analysis: GapAnalysis, final: FinalFit) -> StagePrediction
         ahead, Freed(parts, lambda vectors: Chain(vectors[0], vectors[1] if len(vectors) > 1 else None))
     )
     timed = _Fitted.to(ahead, _timed(ahead, refitted.at()))
-    needed = _needed(of_every_log(analysis, final), timed, ahead, apart, apart.floor(apart.scored_horizon_s))
+    floor, worth = apart.floor(apart.scored_horizon_s), analysis.drive.settings.report.worth_share
+    needed = _needed(of_every_log(analysis, final), timed, ahead, apart, floor, worth)
     amended = _Fitted(needed.candidate.of, needed.fit(ahead), needed.folds)
     stages = {"refitted": refitted, "timed": timed, "amended": amended}
     chains |= {name: stage.chains for name, stage in stages.items()}
@@ -215,18 +216,23 @@ class _Candidate:
         return bool(np.abs(amended.vector[delay_places] - plain[delay_places]).max() > far_s)
 
     def evaluate(self, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
-        """Evaluate the candidate's errors on held-out data."""
-        folds = {fold: ahead.fit(of, fold) for fold, of in self.by_fold.items()}
+        """Evaluate the candidate's errors on held-out data.
+
+        Each fold's fit begins where that of all data ends: from the channels' values single ones ended elsewhere.
+        """
+        joint = ahead.fit(self.of)
+        folds = {fold: ahead.fit(of, fold, joint.vectors) for fold, of in self.by_fold.items()}
         chains = {fold: of.chain(folds[fold].vectors) for fold, of in self.by_fold.items()}
         errors = errors_of(apart.body, apart.wheels, chains, apart.scored_horizon_s, apart.poses)
-        return _Evaluated(self, folds, errors)
+        return _Evaluated(self, joint, folds, errors)
 
 
 @dataclass(frozen=True)
 class _Evaluated:
-    """A candidate, its fits without each fold, and their errors on that."""
+    """A candidate, its fits to all data and without each fold, and the errors of these on that."""
 
     candidate: _Candidate
+    joint: JointFit
     folds: Mapping[int, JointFit]
     errors: PredictionErrors
 
@@ -236,7 +242,7 @@ class _Evaluated:
         From a start far off the whole log may end where no fold does.
         """
         of = self.candidate.of
-        fits = [ahead.fit(of), *(ahead.fit(of, begin=fold.vectors) for fold in self.folds.values())]
+        fits = [self.joint, *(ahead.fit(of, begin=fold.vectors) for fold in self.folds.values())]
         return min(fits, key=lambda one: ahead.usual_cost(of.chain(one.vectors)))
 
 
@@ -259,34 +265,35 @@ def of_every_log(analysis: GapAnalysis, final: FinalFit) -> GapAnalysis:
 
 
 def _needed(
-    analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions, floor: PredictionErrors | None
-) -> _Evaluated:
+    analysis: GapAnalysis, timed: _Fitted, ahead: Ahead, apart: StagePredictions, floor: PredictionErrors | None,
+    worth: float,
+) -> _Evaluated:  # fmt: skip
     """Return the candidate reduced to what predictions need of all that was found.
 
-    Effects and terms are dropped, the least evident first, where held-out data are predicted as well as by the best
-    candidate, by the rule of `decision.py`. What predictions do not need may hold for this log only. `floor`: errors
-    of a perfect model, by the sensors' noise.
+    Effects and terms are dropped, the least evident first, where the mean score of held-out data without them
+    (`decision.py`) exceeds the best candidate's by `worth` at most. What predictions do not need may hold for this log
+    only. `floor`: errors of a perfect model, by the sensors' noise.
     """
     of_channels = _Candidate.of_channels(analysis, apart)
     kept = of_channels.evaluate(ahead, apart)
     if not analysis.found_any:
         return kept
 
-    def best_of_these(options: Iterable[_Evaluated]) -> _Evaluated:
-        return best_of(tuple(options), lambda one: one.errors, floor)
+    def best_of_these(*options: _Evaluated) -> _Evaluated:
+        return best_of(options, lambda one: one.errors, floor)
 
     def topped(candidate: _Candidate) -> _Evaluated:
-        return best_of_these(one.evaluate(ahead, apart) for one in candidate.on_top(timed))
+        return best_of_these(*(one.evaluate(ahead, apart) for one in candidate.on_top(timed)))
 
-    kept = best = best_of_these((kept, topped(of_channels)))
+    kept = best = best_of_these(kept, topped(of_channels))
     for which, name in least_evident_first(analysis):
         fewer = lacking(kept.candidate.analysis, which, name)
         if not fewer.found_any:
             break
         option = topped(_Candidate.of_channels(fewer, apart))
-        if is_as_good(best.errors, option.errors, floor):
+        if excess(best.errors, option.errors, floor) <= worth:
             kept = option
-        best = best_of_these((best, option))
+        best = best_of_these(best, option)
     return kept
 
 

@@ -61,13 +61,17 @@ def chance(best: PredictionErrors, other: PredictionErrors, floor: PredictionErr
     return float(tested.pvalue)
 
 
+def excess(best: PredictionErrors, other: PredictionErrors, floor: PredictionErrors | None) -> float:
+    """Return by how much the other's mean score exceeds the best one's."""
+    return float((score(other, floor) - score(best, floor)).mean())
+
+
 def is_as_good(
     best: PredictionErrors, other: PredictionErrors, floor: PredictionErrors | None, worth: float = 0.0
 ) -> bool:
     """Whether the other's mean score exceeds the best one's by `worth` at most, or by what may be chance."""
-    excess = float((score(other, floor) - score(best, floor)).mean())
     rarest = 0.5 ** best.by_stretch.shape[0]
-    return excess <= worth or chance(best, other, floor) > max(_BY_CHANCE, 1.01 * rarest)
+    return excess(best, other, floor) <= worth or chance(best, other, floor) > max(_BY_CHANCE, 1.01 * rarest)
 
 
 def best_of(options: Sequence[T], errors: Callable[[T], PredictionErrors], floor: PredictionErrors | None) -> T:

@@ -47,6 +47,10 @@ def test_a_name_that_predictions_do_not_need_is_left_out_and_said_and_the_rest_i
     assert notes == ("the amended model leaves out acceleration_slip: held-out data are predicted as well without",)
 
 
+# What the mean score, a log of errors, must gain.
+WORTH = 0.005
+
+
 class Candidate:
     """Stands for a model that may be handed out: it errs by what is said of all that it has, apart or on top."""
 
@@ -73,17 +77,17 @@ class Candidate:
         if self.is_on_top != "far":
             self.judged_so_far.append((has, self.is_on_top))
         square = self.squares.get((has, self.is_on_top), 9.0)
-        return stages._Evaluated(self, {}, errors_in_stretches([square] * 4, [square] * 4))
+        return stages._Evaluated(self, None, {}, errors_in_stretches([square] * 4, [square] * 4))
 
 
-def needed(monkeypatch, squares, wheels=None, body=None):
+def needed(monkeypatch, squares, wheels=None, body=None, worth=WORTH):
     """What is needed of what was found, whether on top of the timed model, and all that was judged."""
     by_set = {(frozenset(names.split()), on_top): square for (names, on_top), square in squares.items()}
     monkeypatch.setattr(Candidate, "squares", by_set, raising=False)
     monkeypatch.setattr(Candidate, "judged_so_far", [], raising=False)
     monkeypatch.setattr(stages, "_Candidate", Candidate)
     analysis = analysis_of(wheels, body)
-    kept = stages._needed(analysis, "timed", "ahead", "apart", None).candidate
+    kept = stages._needed(analysis, "timed", "ahead", "apart", None, worth).candidate
     wheels, body, left_out = told(kept.analysis)
     return " ".join((*(wheels or ()), *(body or ()))), kept.is_on_top, left_out, Candidate.judged_so_far
 
@@ -96,6 +100,9 @@ def test_the_least_evident_goes_first_where_nothing_is_worse_without_and_the_res
     body = found(("turn_slip", "slope", "side_slip"))
     names, on_top, left_out, _ = needed(monkeypatch, squares, body=body)
     assert (names, on_top, left_out) == ("slope", True, ("side_slip", "turn_slip"))
+    # Without the slope squares grow by a hundredth, and so does the score.
+    assert needed(monkeypatch, squares, body=body, worth=0.0101)[0] == "turn_slip"
+    assert needed(monkeypatch, squares, body=body, worth=0.0099)[0] == "slope"
     # Where it does better without, all else is held against that.
     better = {**squares, ("turn_slip slope", True): 0.8, ("slope", True): 0.9}
     assert needed(monkeypatch, better, body=body)[0] == "turn_slip slope"

@@ -194,7 +194,7 @@ def test_the_fit_of_all_data_begins_from_those_of_the_folds_too_and_the_best_is_
     lags = [0.001, 0.201, 0.401]
     folds = {held: JointFit((BODY.neutral, WHEEL.neutral + 0.2 * (1 + held)), 0.0, (), np.eye(0)) for held in (0, 1)}
     ahead = Noted(0.001, [0.0 if k == best else 1.0 + k for k in range(3)])
-    found = stages._Evaluated(SimpleNamespace(of=of), folds, None).fit(ahead)
+    found = stages._Evaluated(SimpleNamespace(of=of), ahead.fit(of), folds, None).fit(ahead)
     assert [chain.wheels[LAG] for chain in ahead.costed] == pytest.approx(lags)
     assert [left_out for _, left_out in ahead.asked] == [None] * 3
     assert found.vectors[1][LAG] == pytest.approx(lags[best])
