@@ -216,15 +216,23 @@ class _Candidate:
         return bool(np.abs(amended.vector[delay_places] - plain[delay_places]).max() > far_s)
 
     def evaluate(self, ahead: Ahead, apart: StagePredictions) -> _Evaluated:
-        """Evaluate the candidate's errors on held-out data.
-
-        Each fold's fit begins where that of all data ends: from the channels' values single ones ended elsewhere.
-        """
+        """Evaluate the candidate's errors on held-out data."""
         joint = ahead.fit(self.of)
-        folds = {fold: ahead.fit(of, fold, joint.vectors) for fold, of in self.by_fold.items()}
+        folds = {fold: self._fit_without(fold, joint, ahead) for fold in self.by_fold}
         chains = {fold: of.chain(folds[fold].vectors) for fold, of in self.by_fold.items()}
         errors = errors_of(apart.body, apart.wheels, chains, apart.scored_horizon_s, apart.poses)
         return _Evaluated(self, joint, folds, errors)
+
+    def _fit_without(self, fold: int, joint: JointFit, ahead: Ahead) -> JointFit:
+        """Fit the data without one fold, from the values that the channels have without it.
+
+        Where that ends far above what the fit of all data costs on the same data, it begins there. Elsewhere it must
+        not: what only the left out data tell would stay as they tell it.
+        """
+        of, worth = self.by_fold[fold], self.analysis.drive.settings.report.worth_share
+        own = ahead.fit(of, fold)
+        costs = [ahead.usual_cost(of.chain(one.vectors), fold) for one in (own, joint)]
+        return own if costs[0] <= costs[1] + worth else ahead.fit(of, fold, joint.vectors)
 
 
 @dataclass(frozen=True)
@@ -285,7 +293,9 @@ def _needed(
     def topped(candidate: _Candidate) -> _Evaluated:
         return best_of_these(*(one.evaluate(ahead, apart) for one in candidate.on_top(timed)))
 
-    kept = best = best_of_these(kept, topped(of_channels))
+    best = best_of_these(kept, topped(of_channels))
+    if excess(best.errors, kept.errors, floor) > worth:
+        kept = best
     for which, name in least_evident_first(analysis):
         fewer = lacking(kept.candidate.analysis, which, name)
         if not fewer.found_any:

@@ -128,9 +128,17 @@ class Ahead:
         track, _ = chain_track(self.body, self.wheels, chain, turned)
         return [prediction_error(self.body, starts, chain.body, track, ahead_s) for ahead_s, starts in self.starts]
 
-    def usual_cost(self, chain: Chain) -> float:
-        """Return the usual size of prediction errors, to compare chains: the sum of the logs of both errors' sizes."""
-        return sum(float(np.log(_usual(error)[1:]).sum()) for error in self.errors(chain))
+    def usual_cost(self, chain: Chain, left_out: int | None = None) -> float:
+        """Return the usual size of prediction errors, to compare chains: the sum of the logs of both errors' sizes.
+
+        Those that start in the fold `left_out` do not count.
+        """
+        errors = zip(self.errors(chain), self._outside(left_out), strict=True)
+        return sum(float(np.log(_usual(error[mask])[1:]).sum()) for error, mask in errors)
+
+    def _outside(self, left_out: int | None) -> list[Mask]:
+        """Return which starts lie outside a fold, by horizon."""
+        return [starts.block % self.folds != left_out for _, starts in self.starts]
 
     def fit(self, of: Freed, left_out: int | None = None, begin: Sequence[Array] | None = None) -> JointFit:
         """Fit the freed entries so that they predict best, without the fold `left_out` if there is one.
@@ -141,7 +149,7 @@ class Ahead:
         count linearly (Huber, 1964). Neighbouring predictions overlap, so that each counts for the time it adds.
         """
         settings = self.body.settings
-        chosen = [starts.block % self.folds != left_out for _, starts in self.starts]
+        chosen = self._outside(left_out)
         every_s = settings.grid.start_every_s
         shares = [min(every_s / ahead_s, 1.0) ** 0.5 for ahead_s, _ in self.starts]
         start, step = of.joined(lambda part: part.vector), of.joined(lambda part: part.layout.step)

@@ -140,7 +140,7 @@ class Noted:
         moved = of.vectors(at.joined(lambda part: part.vector) + self.by * (1 if left_out is None else 2 + left_out))
         return JointFit(tuple(moved), 0.0, of.names, np.eye(len(of.names)))
 
-    def usual_cost(self, chain):
+    def usual_cost(self, chain, left_out=None):
         self.costed.append(chain)
         return self.costs[len(self.costed) - 1]
 
@@ -200,6 +200,18 @@ def test_the_fit_of_all_data_begins_from_those_of_the_folds_too_and_the_best_is_
     assert found.vectors[1][LAG] == pytest.approx(lags[best])
 
 
+@pytest.mark.parametrize(("gains", "begins_again"), [(0.11, True), (0.09, False)])
+def test_a_fit_without_a_fold_begins_where_the_whole_fit_ended_only_if_its_own_end_is_far_above(gains, begins_again):
+    of, whole = two_parts((LAG,)), two_parts((LAG,)).at((BODY.neutral, WHEEL.neutral + 0.2))
+    settings = SimpleNamespace(report=SimpleNamespace(worth_share=0.1))
+    candidate = stages._Candidate(SimpleNamespace(drive=SimpleNamespace(settings=settings)), None, whole, {1: of})
+    ahead = Noted(0.001, [gains, 0.0])
+    joint = ahead.fit(whole)
+    found = candidate._fit_without(1, joint, ahead)
+    assert [chain.wheels[LAG] for chain in ahead.costed] == pytest.approx([0.003, 0.201])
+    assert found.vectors[1][LAG] == pytest.approx(0.204 if begins_again else 0.003)
+
+
 @pytest.fixture
 def unfitted(monkeypatch):
     """Has every fit of the whole chain stay where it begins; what was asked for."""
@@ -225,7 +237,13 @@ def errors_in_turn(monkeypatch, *sizes):
 
 @pytest.mark.parametrize(
     ("apart", "on_top", "told_on_top"),
-    [((0.1, 0.4), (0.3, 0.1), True), ((0.1, 0.2), (0.3, 0.1), False), ((0.2, 0.2), (0.2, 0.19), True)],
+    [
+        ((0.1, 0.4), (0.3, 0.1), True),
+        ((0.1, 0.2), (0.3, 0.1), False),
+        # By more than a tenth, which a change is worth, and by less.
+        ((0.2, 0.2), (0.2, 0.175), True),
+        ((0.2, 0.2), (0.2, 0.19), False),
+    ],
 )
 def test_of_the_amended_stage_the_way_is_told_that_predicts_better(unfitted, monkeypatch, apart, on_top, told_on_top):
     errors_in_turn(monkeypatch, apart, on_top)
