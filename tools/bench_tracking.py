@@ -58,6 +58,7 @@ def contenders(speed_m_s: float = SPEED_M_S) -> dict[str, Contender]:
         "disco_point": disco(replace(settings, uncertainty="point")),
         "disco_ut": disco(settings),
         "disco_adapting": adapting,
+        "disco_backwards": disco(replace(settings, backwards=True), learns=True),
         "disco_sampled": sampled,
         "disco_truth": disco(settings, knows=True),
         "kanayama_truth": classical(Kanayama(), speed_m_s, knows=True),

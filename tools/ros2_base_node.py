@@ -108,7 +108,7 @@ def main(robot: str, *start: str) -> None:
     setup = load_setup(Path(robot))
     config, settings = setup.config, setup.config.link.settings()
     assert isinstance(settings, Ros2BaseSettings)
-    place = BodyPose(*map(float, start)) if start else BodyPose(*config.task.course().start)
+    place = BodyPose(*map(float, start)) if start else BodyPose(*config.task_start)
     plant = Plant(true_parameters(setup, None).with_ideal_motors(), start=place)
     # Kernels are compiled before anybody hears of the base.
     plant.step(1000, 0.0, 0.0)

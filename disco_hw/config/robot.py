@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
@@ -160,6 +161,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     rate_hz: Annotated[float, Meta(ge=20.0, le=100.0)] = 50.0
     mode: Literal["default", "sampled", "paper"] = "default"
     uncertainty: Literal["ut", "mc", "joint", "point"] = "ut"
+    facing: Literal["forwards", "backwards"] = "forwards"
     adaptation: Literal["auto", "off", "fast", "audited"] = "auto"
     disturbance: bool = False
     fallback: Literal["ramp", "pure_pursuit", "kanayama", "lqr"] = "ramp"
@@ -266,3 +268,19 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     drive: Drive = Drive()
     ros2: Ros2 = Ros2()
     fence: Fence = Fence()
+
+    @property
+    def turned_rad(self) -> float:
+        """How far the robot is turned from where it drives to, while it follows its task: 0, or pi backwards."""
+        return math.pi if self.control.facing == "backwards" else 0.0
+
+    @property
+    def task_start(self) -> tuple[float, float, float]:
+        """Where the task starts, and how the robot faces there: x, y (m), yaw (rad)."""
+        x_m, y_m, yaw_rad = self.task.course().start
+        return x_m, y_m, yaw_rad + self.turned_rad
+
+    @property
+    def footprint_along_line(self) -> Footprint:
+        """The footprint as seen along the task's line: of a robot that drives backwards what is behind lies ahead."""
+        return self.robot.footprint.turned if self.turned_rad else self.robot.footprint

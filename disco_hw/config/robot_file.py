@@ -46,7 +46,7 @@ def refuse_outside_task(path: Path, config: RobotConfig) -> None:
     """Raise InputError, naming the place, for a task on whose line or start the footprint is not within the fence."""
     from disco_hw.fence.clearance import task_breach  # noqa: PLC0415
 
-    fault = task_breach(config.fence, config.robot.footprint, config.task.course())
+    fault = task_breach(config.fence, config.footprint_along_line, config.task.course())
     if fault is not None:
         _refuse(path, "fence", fault, "move the task or the fence")
 
@@ -276,6 +276,11 @@ def _check_task(path: Path, config: RobotConfig) -> None:
         )
     if config.control.fallback != "ramp" and math.isnan(config.task.reference_speed_m_s):
         _refuse(path, "control.fallback", "way-points with times have no single speed to follow", 'write "ramp"')
+    if config.control.facing == "backwards":
+        if config.control.mode == "paper":
+            _refuse(path, "control.facing", "the paper's cost knows of no facing", 'write mode = "default"')
+        if config.control.fallback != "ramp":
+            _refuse(path, "control.facing", "the law of control.fallback drives forwards", 'write fallback = "ramp"')
     fault = config.task.fault()
     if fault is not None:
         _refuse(path, f"task.{fault.field}", fault.fault, fault.hint)

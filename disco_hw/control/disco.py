@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+from disco_hw.control.backwards import Backwards
 from disco_hw.control.kernel import BLOCK, CHANNELS, START_LEFT, START_RIGHT, START_SIZE, WHEEL_ROWS, aligned_zeros
 from disco_hw.control.kernel.avoid import Area
 from disco_hw.control.kernel.guide import SteeredChassis
@@ -59,6 +60,7 @@ class Disco:
         surroundings: Surroundings | None = None,
     ) -> None:  # fmt: skip
         self.task, self.settings, self._surroundings = task, settings, surroundings
+        self._costed = self._seen(task)
         self._points = points = RolloutPoints(model, settings, limits, seed)
         self._limits = limits
         self._prediction = StatePrediction(points, settings, limits)
@@ -106,8 +108,12 @@ class Disco:
         """Plan for another task of the same type from the next `plan` on; nothing is compiled. Raises TypeError."""
         if type(task) is not type(self.task):
             raise TypeError(f"the planner was compiled for {type(self.task).__name__}, not {type(task).__name__}")
-        self.task = task
+        self.task, self._costed = task, self._seen(task)
         self.reset()
+
+    def _seen(self, task: PlannedTask) -> PlannedTask:
+        """Return the task as its costs see the robot: as it is, or with its back as its front."""
+        return Backwards(task) if self.settings.backwards else task
 
     def look_around(self, bounds: Boundaries, deviation_m: float) -> None:
         """Keep away from these boundaries from the next plan on; nothing without surroundings.
@@ -188,7 +194,7 @@ class Disco:
         """Return what the compiled step rolls out: f_theta from the plan's start, and the task's cost."""
         points, settings = self._points, self.settings
         x, y, yaw, left, right = begin.state.tolist()
-        task, (origin_x, origin_y), place, self._memory = self.task.prepare(
+        task, (origin_x, origin_y), place, self._memory = self._costed.prepare(
             task_s, x, y, yaw, self._memory, settings.step_s, settings.sampler.horizon, points.chassis.x_icr_m
         )
         direction = (math.cos(yaw), math.sin(yaw)) if math.isfinite(yaw) else (math.nan, math.nan)

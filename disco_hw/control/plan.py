@@ -125,6 +125,7 @@ class DiscoSettings:
     iterations_at_start: optimisation steps for the first plan after a reset.
     refine: whether a Gauss-Newton refinement in the mean of the belief improves the plan beside the task's line
     (refinement.py).
+    backwards: whether the robot follows the task's line with its back ahead (backwards.py).
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
     decay_s: how long the planner answers with a ramp to zero when nothing helps, before it raises NoValidControl.
@@ -140,6 +141,7 @@ class DiscoSettings:
     guide_below: float = 0.85
     euler: bool = False
     refine: bool = True
+    backwards: bool = False
     iterations_at_start: int = 5
     min_ess: float = 3.0
     retries: int = 2
@@ -216,7 +218,8 @@ class DiscoSettings:
             step_s, horizon = control.step_s, horizon if control.mode == "paper" else Sampler().horizon
         horizon = horizon if control.horizon is None else control.horizon
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)
-        return replace(settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty)
+        backwards = control.facing == "backwards"
+        return replace(settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty, backwards=backwards)
 
 
 class NoValidControl(Exception):  # noqa: N818

@@ -15,6 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from disco_hw.control.backwards import task_of, turned_chassis, turned_start
 from disco_hw.control.kernel import CARRIED_X, CARRIED_Y, START_COS, START_SIN, START_X, START_Y, Terms
 from disco_hw.control.kernel.guide import SteeredChassis, timed_reference
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, LateralLag, Problem, refine
@@ -66,6 +67,7 @@ class Refinement:
     def __init__(self, limits: CommandLimits, settings: DiscoSettings, history: int) -> None:
         """Refine within the limits, in the steps of `settings`, after `history` commands from before the plan."""
         self._limits, self._step_s, self._history = limits, settings.step_s, history
+        self._backwards = settings.backwards
         self._rows = np.arange(min(STEPS, settings.sampler.horizon))
         self._series = integration_series(settings.step_s, wide=True)
         self._reference = np.zeros((self._rows.size, CHANNELS), np.float32)
@@ -81,6 +83,11 @@ class Refinement:
     @property
     def _horizon_s(self) -> float:
         return self._rows.size * self._step_s
+
+    @property
+    def _ahead(self) -> float:
+        """Sign of the speed at which the robot follows the line."""
+        return -1.0 if self._backwards else 1.0
 
     @property
     def speed_part(self) -> float:
@@ -100,7 +107,7 @@ class Refinement:
 
     def set_model(self, model: Model, chassis: SteeredChassis) -> None:
         """Refine in the mean of this model's belief from now on."""
-        self._chassis = chassis
+        self._chassis = turned_chassis(chassis) if self._backwards else chassis
         self._base, self._effects = coefficient_tables(model, mean_point(model), self._step_s)
         if self._buffers is None:
             self._buffers = create_buffers(self._rows.size, self._history, new_means(self._effects))
@@ -111,10 +118,12 @@ class Refinement:
         `terms` of the task and `start` (10,) are those of `SkidSteer`.
         What is returned is kept as the start of the next refinement.
         """
-        is_timed = hasattr(terms, "headings")
-        if not (is_timed or hasattr(terms, "line_at")):
+        task = task_of(terms)
+        is_timed = hasattr(task, "headings")
+        if not (is_timed or hasattr(task, "line_at")):
             return None
-        moves = self._set_reference(terms, start)
+        # The reference, and what is found on the line, are those of the robot as the task sees it.
+        moves = self._set_reference(task, turned_start(start) if self._backwards else start)
         distance_m, facing, _, _, _, way_m = self._found.tolist()
         problem, buffers = self._posed(begin, start, way_m), self._buffers
         assert buffers is not None
@@ -122,7 +131,8 @@ class Refinement:
             # Off the line too, so that no compilation waits for the robot to reach it.
             self._call("refine", refine, problem, buffers, 0, 0)
         last, self._last = self._last, None
-        covered_m = 0.5 * float(begin.state[3] + begin.state[4]) * self._chassis.wheel_radius_m * self._horizon_s
+        forward_rad_s = self._ahead * 0.5 * float(begin.state[3] + begin.state[4])
+        covered_m = forward_rad_s * self._chassis.wheel_radius_m * self._horizon_s
         progress = self._progress.after(begin.t0_ns, covered_m / max(way_m, 1e-3))
         part = TIMED_PART if is_timed else LATERAL_PART
         carried_m = DRIFT_MARGIN * self._rows.size * math.hypot(start[CARRIED_X], start[CARRIED_Y])
@@ -181,7 +191,7 @@ class Refinement:
             self._start, float(begin.elapsed_s), np.array(begin.drift, np.float64), lateral, begin.mean_means,
             self._base, self._effects, self._series, self._history, self._reference,
             float(self._limits.speed_rad_s), float(change), self._before, change_m,
-            self._found[3:5], end_weight, behind_m,
+            self._ahead * self._found[3:5], end_weight, behind_m,
         )  # fmt: skip
 
     def _call(self, name: str, kernel: Callable[..., object], *arguments: object) -> float:

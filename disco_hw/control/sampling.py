@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from disco_hw.control.backwards import BackwardsTerms, guide_backwards, task_of
 from disco_hw.control.kernel import Floats
 from disco_hw.control.kernel.avoid import TOUCH_COST
 from disco_hw.control.kernel.guide import SteeredChassis, guide
@@ -109,15 +110,19 @@ class Guidance:
     def offer(self, system: SkidSteer, chassis: SteeredChassis, before: tuple[float, float]) -> bool:
         """Make the guide a sample of the next step; returns whether the task has a line to be guided along."""
         optimiser = self._optimiser
-        if self._settings.guide_below <= 0.0 or not hasattr(system.task, "way_ahead_m"):
+        terms = task_of(system.task)
+        if self._settings.guide_below <= 0.0 or not hasattr(terms, "way_ahead_m"):
             optimiser.sample_guide(False)
             return False
         optimiser.sample_guide(True)
         commands, step_s = optimiser.work.guide, self._settings.step_s
-        arguments = commands, system.task, system.start, chassis, *before, optimiser.limits, step_s
+        arguments = system.start, chassis, *before, optimiser.limits, step_s
         if self._guide is None:
-            self._guide = compiled_for(guide, *arguments)
-        self._guide(*arguments)
+            self._guide = compiled_for(guide, commands, terms, *arguments)
+        if isinstance(system.task, BackwardsTerms):
+            guide_backwards(self._guide, commands, system.task, *arguments)
+        else:
+            self._guide(commands, terms, *arguments)
         return True
 
     def has_robot(self, now_ns: int, system: SkidSteer, trajectory: Array) -> bool:
@@ -128,7 +133,7 @@ class Guidance:
         settings = self._settings
         horizon_s = settings.sampler.horizon * settings.step_s
         half = min(settings.sampler.horizon // 2, len(trajectory) - 1)
-        way_m = system.task.way_ahead_m(half * settings.step_s)
+        way_m = task_of(system.task).way_ahead_m(half * settings.step_s)
         # From the last place on: that of a plan which does not stand is far enough.
         begin, *places = trajectory[: half + 1, :2].tolist()
         if all(math.dist(begin, place) < NEAR_ZERO_SPEED * way_m for place in reversed(places)):

@@ -274,7 +274,7 @@ class Daemon:
         """Change the task, if this state and the robot's limits allow it."""
         try:
             task = changed_task(self._core.task, message.arguments, self._core.config.robot, self._core.state)
-            fault = task_breach(self._core.area.fence, self._core.area.footprint, task.course())
+            fault = task_breach(self._core.area.fence, self._core.config.footprint_along_line, task.course())
             if fault is not None:
                 raise TaskRefused(f"fence: {fault}; keep the task inside")
         except TaskRefused as refused:

@@ -222,7 +222,7 @@ def task_drive(
 
     Without `guarded` the guard is off, and the planner alone keeps to the fence.
     """
-    x_m, y_m, yaw_rad = setup.config.task.course().start
+    x_m, y_m, yaw_rad = setup.config.task_start
     start = BodyPose(x_m, y_m, yaw_rad + facing_rad)
     run = SimulatedRun(setup, virtual_robot(setup, plant, start, seed=seed), planner)
     fence = setup.config.fence

@@ -191,7 +191,7 @@ def without_effects(amended: Model, given: Model) -> Model:
 
 def _robot(setup: Setup, options: GapExperimentOptions, hidden: Mapping[str, tuple[float, ...]]) -> RobotInProcess:
     parameters = true_parameters(setup, options.plant_seed)
-    start = BodyPose(*setup.config.task.course().start)
+    start = BodyPose(*setup.config.task_start)
     return virtual_robot(setup, parameters, start, effects=hidden, seed=options.seed)
 
 

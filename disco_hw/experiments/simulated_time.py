@@ -200,7 +200,7 @@ def drive_virtual(
     setup = _at_the_reference_controller(load_setup(Path(robot), None if model is None else Path(model)))
     if log is not None:
         refuse_file(Path(log))
-    start = BodyPose(*setup.config.task.course().start)
+    start = BodyPose(*setup.config.task_start)
     try:
         virtual = virtual_robot(setup, true_parameters(setup, None), start, effects=hide, seed=seed)
     except HiddenEffectError as error:

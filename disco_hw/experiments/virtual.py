@@ -71,7 +71,7 @@ def run_sim(
     controller = (
         None if create_controller is None else partial(create_controller, config.link.settings(), ticks_per_rev)
     )
-    x_m, y_m, yaw_rad = start or config.task.course().start
+    x_m, y_m, yaw_rad = start or config.task_start
     # The robot that a model without effects describes; what its motors should lack is hidden by the user.
     plant, key = true_parameters(setup, plant_seed).with_ideal_motors(), link_key(setup)
     print(

@@ -48,6 +48,11 @@ class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Distance from the tracked point to the farthest corner."""
         return math.hypot(abs(self.ahead) + 0.5 * self.length, 0.5 * self.width)
 
+    @property
+    def turned(self) -> Footprint:
+        """The same rectangle of the robot with its back called its front."""
+        return Footprint(self.length, self.width, -self.ahead)
+
     def corners_m(self) -> tuple[Point, Point, Point, Point]:
         """Return the corners relative to the tracked point, ahead and to the left, in counter-clockwise order."""
         back, front, side = self.ahead - 0.5 * self.length, self.ahead + 0.5 * self.length, 0.5 * self.width

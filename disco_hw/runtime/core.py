@@ -356,7 +356,9 @@ class DaemonCore:
 
     def _follow_progress(self, output: Output, result: Tick) -> None:
         if output.running and not self._jump:
-            self.progress.add(result.t_ns, result.estimate.x_m, result.estimate.y_m, result.estimate.yaw_rad)
+            pose = result.estimate
+            # A path that crosses itself is begun on the branch that the robot drives along.
+            self.progress.add(result.t_ns, pose.x_m, pose.y_m, pose.yaw_rad + self.config.turned_rad)
         else:
             self.progress.pause()
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from disco_hw.config import SHIPPED_ROBOT, Prior, load_robot_config
 from disco_hw.errors import InputError
+from disco_hw.fence import Footprint
 from disco_hw.tasks import kinds, task_class
 from disco_hw.tasks.circle import circle_task
 from disco_hw.tasks.path import PathTask
@@ -225,3 +228,31 @@ def test_way_points_by_time_take_no_fallback(tmp_path):
         load_robot_config(file)
     file.write_text(file.read_text().replace('"lqr"', '"ramp"'))
     assert load_robot_config(file).control.fallback == "ramp"
+
+
+def test_a_robot_that_drives_backwards_starts_with_its_back_to_where_the_line_goes(tmp_path):
+    forwards, backwards = (load(tmp_path, GOOD + control) for control in ("", '[control]\nfacing = "backwards"\n'))
+    *place, yaw_rad = forwards.task.course().start
+    assert forwards.task_start == (*place, yaw_rad)
+    assert backwards.task_start == pytest.approx((*place, yaw_rad + math.pi))
+    assert (forwards.turned_rad, backwards.turned_rad) == (0.0, math.pi)
+    robot = msgspec.structs.replace(forwards.robot, footprint_m=Footprint(0.6, 0.4, 0.1))
+    seen = [msgspec.structs.replace(config, robot=robot).footprint_along_line.ahead for config in (forwards, backwards)]
+    assert seen == [0.1, -0.1]
+
+
+@pytest.mark.parametrize(
+    ("with_it", "expected_error"),
+    [
+        ('mode = "paper"', r"control\.facing: the paper's cost knows of no facing; write mode = \"default\""),
+        ('fallback = "lqr"', r"control\.facing: .* drives forwards; write fallback = \"ramp\""),
+    ],
+)
+def test_the_paper_and_other_laws_drive_forwards_only(tmp_path, with_it, expected_error):
+    for facing in ("forwards", "backwards"):
+        text = GOOD + f'[control]\nfacing = "{facing}"\n{with_it}\n'
+        if facing == "forwards":
+            load(tmp_path, text)
+            continue
+        with pytest.raises(InputError, match=expected_error):
+            load(tmp_path, text)

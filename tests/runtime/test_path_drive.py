@@ -55,6 +55,23 @@ def test_the_shipped_eight_is_followed_once_round(tmp_path):
     assert speeds[100:].mean() == pytest.approx(0.3, abs=0.05)
 
 
+@pytest.mark.thorough
+def test_the_shipped_eight_is_followed_backwards_recorded_and_replayed(tmp_path):
+    robot_file = path_robot(tmp_path, speed_m_s=0.2)
+    text = robot_file.read_text()
+    assert text.count("[control]\n") == 1
+    robot_file.write_text(text.replace("[control]\n", '[control]\nfacing = "backwards"\n'))
+    setup = load_setup(robot_file)
+    stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task_start))
+    start(stack, 0.02)
+    places, speeds = drive(stack, lambda: stack.core.progress.laps >= 1.0)
+    assert stack.core.progress.laps >= 1.0
+    off_m = setup.config.task.course().off_m(places)
+    assert np.sqrt(np.mean(off_m[100:] ** 2)) < 0.02
+    assert speeds[100:].max() < 0.0
+    replayed(write_run(stack, tmp_path / "run.mcap"))
+
+
 def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_without_its_file(tmp_path):
     robot_file = path_robot(tmp_path, CORNER)
     setup, stack = started(robot_file)

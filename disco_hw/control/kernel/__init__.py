@@ -14,6 +14,7 @@ from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from disco_hw import tasks
@@ -173,7 +174,8 @@ def _looks_up(terms: Any) -> Callable[[Any], bool | None] | None:
     fields = getattr(getattr(terms, "instance_class", None), "_fields", None)
     if fields is None:
         return None
-    return (lambda terms: True) if "table" in fields else (lambda terms: None)
+    has_table = "table" in fields and not isinstance(terms[fields.index("table")], types.NoneType)
+    return (lambda terms: True) if has_table else (lambda terms: None)
 
 
 # The compiler wants Python code, which calls the compiled function.
