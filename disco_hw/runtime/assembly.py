@@ -238,7 +238,7 @@ def preflight(config: RobotConfig, driver: Driver, with_task: bool = True) -> tu
         return ()
     checks = check_firmware_limits(config.robot, driver.limits)
     if with_task:
-        checks.append(check_task(config.robot, config.task))
+        checks.append(check_task(config))
     return tuple(check.text for check in checks if check.level is Level.FAIL)
 
 

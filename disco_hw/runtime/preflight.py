@@ -8,9 +8,8 @@ import statistics
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from disco_hw.config import Control, Link, Robot
+from disco_hw.config import Control, Link, Robot, RobotConfig
 from disco_hw.fence import Fence
-from disco_hw.tasks import RobotTask
 from drivers.motor import find_driver
 from drivers.types import SOURCE_TEXTS, CyclicFrame, Limits, SafetyCard
 from firmware_protocol.serial_framing import BITS_PER_BYTE
@@ -132,12 +131,16 @@ def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
     return [Check("firmware limits", Level.OK, "; ".join(found))]
 
 
-def check_task(robot: Robot, task: RobotTask) -> Check:
+def check_task(config: RobotConfig) -> Check:
     """Compare the task's speed with what the nominal robot's wheels can do on it."""
+    robot, task = config.robot, config.task
     refusal = task.too_fast(robot)
     if refusal is not None:
         return Check("task", Level.FAIL, f"task.speed_m_s: {refusal}")
-    return Check("task", Level.OK, f"{task.describe()}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it")
+    backwards = ", driven backwards" if config.turned_rad else ""
+    return Check(
+        "task", Level.OK, f"{task.describe()}{backwards}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it"
+    )
 
 
 def check_fence(robot: Robot, fence: Fence) -> list[Check]:

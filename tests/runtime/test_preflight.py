@@ -3,7 +3,7 @@ import math
 import msgspec
 import pytest
 
-from disco_hw.config import Control, Link, Robot
+from disco_hw.config import Control, Link, Robot, RobotConfig
 from disco_hw.runtime.preflight import (
     Level,
     check_command_timing,
@@ -171,7 +171,7 @@ def test_round_trip_gives_median_and_worst():
 )
 def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
     def found(speed_m_s):
-        return check_task(robot(), msgspec.structs.replace(task, speed_m_s=speed_m_s))
+        return check_task(RobotConfig(robot=robot(), task=msgspec.structs.replace(task, speed_m_s=speed_m_s)))
 
     fastest = task.fastest_m_s(robot())
     assert found(0.1).level is found(fastest).level is Level.OK
@@ -179,6 +179,12 @@ def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
     assert too_fast.level is Level.FAIL
     assert too_fast.text.startswith("task.speed_m_s: ")
     assert "at most" in too_fast.text
+
+
+@pytest.mark.parametrize(("facing", "said"), [("forwards", False), ("backwards", True)])
+def test_a_robot_that_drives_backwards_is_told_so_before_it_is_armed(facing, said):
+    config = RobotConfig(robot=robot(), task=CircleTask(), control=Control(facing=facing))
+    assert (", driven backwards; the wheels can do" in check_task(config).text) is said
 
 
 @pytest.mark.parametrize(
