@@ -6,18 +6,19 @@ Each robot's tracked point lies behind its centre of rotation, so that backwards
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
-from disco_hw.control.backwards import Backwards, BackwardsTerms, guide_backwards
+from disco_hw.control.backwards import Backwards, BackwardsTerms, guide_backwards, turned_start
 from disco_hw.control.kernel import follow, row_of, stage_cost, terminal_cost
 from disco_hw.control.kernel.guide import guide
 from disco_hw.control.kernel.sequences import Limits
 from disco_hw.control.refinement import Refinement
 from disco_hw.control.rollout_points import RolloutPoints
-from disco_hw.control.state_prediction import StatePrediction
+from disco_hw.control.state_prediction import PlanStart, StatePrediction
 from disco_hw.jit import compiled_for, kernel_function
 from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
@@ -42,23 +43,23 @@ ZERO, ONE = np.float32(0.0), np.float32(1.0)
 FOUND = (ZERO, ZERO, ZERO, ONE, ZERO)
 
 
-def round_the_circle(speed_m_s: float = SPEED_M_S) -> PlannerState:
-    """A robot that goes round backwards: its axle, 0.2 m ahead, is turned out of the circle by what that needs."""
-    yaw = 1.5 * math.pi - math.asin(X_ICR_M / RADIUS_M)
-    turn, forward = speed_m_s / RADIUS_M, -speed_m_s * math.cos(math.asin(X_ICR_M / RADIUS_M))
+def round_the_circle(x_icr_m: float = X_ICR_M) -> PlannerState:
+    """A robot that goes round backwards: its axle, so far ahead, is turned out of the circle by what that needs."""
+    outwards = math.asin(x_icr_m / RADIUS_M)
+    yaw, turn, forward = 1.5 * math.pi - outwards, SPEED_M_S / RADIUS_M, -SPEED_M_S * math.cos(outwards)
     return PlannerState(0, RADIUS_M, 0.0, yaw, *((forward + side * 0.2 * turn) / 0.06 for side in (-1.0, 1.0)))
 
 
-def rolled_out(commands: np.ndarray, state: PlannerState, step_s: float) -> np.ndarray:
+def rolled_out(commands: np.ndarray, state: PlannerState, step_s: float, model: Model = MODEL) -> np.ndarray:
     """Places (T + 1, 2) of the robot as it is."""
     start = np.array([state.x_m, state.y_m, state.yaw_rad, state.left_speed_rad_s, state.right_speed_rad_s])
-    run = FreeRun(MODEL, MODEL.point()[None], step_s)
+    run = FreeRun(model, model.point()[None], step_s)
     return np.asarray(run.states(start, np.asarray(commands, np.float64), 0)[:, :2])
 
 
-def prepared(name: str, state: PlannerState) -> BackwardsTerms:
+def prepared(name: str, state: PlannerState, x_icr_m: float = X_ICR_M) -> BackwardsTerms:
     made = Backwards(TASKS[name]).prepare(
-        0.0, state.x_m, state.y_m, state.yaw_rad, None, SETTINGS.step_s, SETTINGS.sampler.horizon, X_ICR_M
+        0.0, state.x_m, state.y_m, state.yaw_rad, None, SETTINGS.step_s, SETTINGS.sampler.horizon, x_icr_m
     )
     assert isinstance(made.terms, BackwardsTerms)
     return made.terms
@@ -88,6 +89,13 @@ def test_a_cost_sees_the_robot_with_its_back_as_its_front(name):
         assert looked_up(terms, forward) == looked_up(terms.task, -forward) != looked_up(terms.task, forward)
 
 
+def test_the_turned_robot_begins_where_the_robot_does_and_faces_away_with_its_wheels_exchanged():
+    """At 1, 2 m, facing along y, its wheels at 3 and 5 rad/s; time, place and drift stay what they are."""
+    start = np.array([1.0, 2.0, 0.0, 1.0, 3.0, 5.0, 6.0, 7.0, 8.0, 9.0], np.float32)
+    assert turned_start(start).tolist() == [1.0, 2.0, 0.0, -1.0, -5.0, -3.0, 6.0, 7.0, 8.0, 9.0]
+    assert start[3] == 1.0
+
+
 def test_the_guide_leads_along_the_line_backwards():
     """From 2 cm beside it, within the limits, and away from where the robot faces."""
     on_it = round_the_circle()
@@ -113,33 +121,40 @@ def test_the_guide_leads_along_the_line_backwards():
     places = rolled_out(commands, state, 0.1)
     assert np.abs(np.hypot(*places[20:].T) - RADIUS_M).max() < 0.005
     assert (commands.sum(axis=1) < 0.0).all()
-    assert np.abs(np.diff(commands, axis=0)).max() <= change + 1e-6
+    assert np.abs(np.diff(commands, axis=0, prepend=[wheels])).max() <= change + 1e-6
     # On, counter-clockwise, by about as much as the task asks for.
     assert math.atan2(places[-1, 1], places[-1, 0]) == pytest.approx(4.0 * SPEED_M_S / RADIUS_M, rel=0.05)
 
 
-def test_a_refined_plan_stays_on_the_line_backwards():
-    """Within a millimetre, in the sense in which it goes round forwards."""
-    state = round_the_circle()
-    points = RolloutPoints(MODEL, SETTINGS, LIMITS, 1)
+@pytest.mark.parametrize("x_icr_m", [X_ICR_M, -X_ICR_M], ids=["easier", "harder"])
+def test_a_refined_plan_stays_on_the_line_backwards(x_icr_m):
+    """Within a millimetre, in the sense in which it goes round forwards; with the axle behind, too."""
+    state, model = round_the_circle(x_icr_m), replace(MODEL, x_icr_m=x_icr_m)
+    points = RolloutPoints(model, SETTINGS, LIMITS, 1)
     refinement = Refinement(LIMITS, SETTINGS, points.history)
     refinement.set_model(points.model, points.chassis)
     begin = StatePrediction(points, SETTINGS, LIMITS).start(state, 0, 0.0)
     start = np.zeros(10, np.float32)
     start[:6] = state.x_m, state.y_m, math.cos(state.yaw_rad), math.sin(state.yaw_rad), *begin.before
     nominal = np.tile(begin.before, (SETTINGS.sampler.horizon, 1)) + np.array([0.3, -0.3])
-    terms = prepared("circle", state)
-    commands = refinement.improve(terms, start, begin, nominal)
-    for _ in range(5):
-        commands = refinement.improve(terms, start, begin, nominal)
+    terms = prepared("circle", state, x_icr_m)
+
+    def refined(begin: PlanStart) -> np.ndarray | None:
+        refinement.reset()
+        for _ in range(6):
+            commands = refinement.improve(terms, start, begin, nominal)
+        return commands
+
+    commands = refined(begin)
     assert commands is not None
-    places = rolled_out(commands, state, SETTINGS.step_s)
+    places = rolled_out(commands, state, SETTINGS.step_s, model)
     assert np.abs(np.hypot(*places.T) - RADIUS_M).max() < 1e-3
     assert (commands.sum(axis=1) < 0.0).all()
+    # The lag of the sideways speed is counted on where the point is behind, as it drives.
+    lagging = refined(begin._replace(lateral_lag_s=0.1))
+    assert np.array_equal(lagging, commands) is (x_icr_m > 0.0)
     # A robot that rolls forwards makes no progress along its line, and is left to the sampled plan.
-    forwards = begin._replace(state=begin.state * [1.0, 1.0, 1.0, -1.0, -1.0])
-    refinement.reset()
-    assert refinement.improve(terms, start, forwards, nominal) is None
+    assert refined(begin._replace(state=begin.state * [1.0, 1.0, 1.0, -1.0, -1.0])) is None
 
 
 def closed_loop(planner: Disco, state: PlannerState, seconds: float, model: Model = MODEL) -> np.ndarray:
