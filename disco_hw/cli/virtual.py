@@ -33,6 +33,9 @@ def demo(
     obstacle: Annotated[
         bool, typer.Option("--obstacle", help="Put a pillar on the circle and drive around it (docs/fence.md).")
     ] = False,
+    backwards: Annotated[
+        bool, typer.Option("--backwards", help="Drive with the robot's back ahead (docs/control.md).")
+    ] = False,
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port of the page.")] = DEFAULT_PORT,
     as_json: AsJson = False,
 ) -> None:
@@ -50,6 +53,7 @@ def demo(
             view=view,
             adapt=adapt,
             obstacle=obstacle,
+            backwards=backwards,
             port=port,
             show_progress=not as_json,
         )

@@ -62,12 +62,15 @@ class EstimationFigures:
     rms_yaw_rad: float
 
 
-def circle_figures(path: Path, task: CircleTask) -> CircleFigures:
-    """Summarise a path around the circle; raises ValueError for a path of fewer than two samples."""
+def circle_figures(path: Path, task: CircleTask, backwards: bool = False) -> CircleFigures:
+    """Summarise a path around the circle; raises ValueError for a path of fewer than two samples.
+
+    `backwards`: the robot is to drive with its back ahead.
+    """
     if path.t_s.size < 2:
         raise ValueError("a path needs at least two samples")
     distance = np.abs(np.hypot(path.x_m - task.center_x_m, path.y_m - task.center_y_m) - task.radius_m)
-    speed_error = path.speed_m_s - task.speed_m_s
+    speed_error = (-path.speed_m_s if backwards else path.speed_m_s) - task.speed_m_s
     cost = np.hypot(distance, speed_error)
     angle = np.unwrap(np.arctan2(path.y_m - task.center_y_m, path.x_m - task.center_x_m))
     laps = (angle - angle[0]) / (2.0 * np.pi)
@@ -232,9 +235,13 @@ class CircleReport:
 
 
 def load_circle_report(
-    log_file: FilePath, truth_file: FilePath, task: CircleTask, laps_requested: float, stopped: bool
-) -> CircleReport:
-    """Read log and truth of one run; raises WorkError if the task never ran, or a file is not whole or does not fit."""
+    log_file: FilePath, truth_file: FilePath, task: CircleTask, laps_requested: float, stopped: bool,
+    backwards: bool = False,
+) -> CircleReport:  # fmt: skip
+    """Read log and truth of one run, driven `backwards` or not.
+
+    Raises WorkError if the task never ran, or a file is not whole or does not fit.
+    """
     log = open_log(log_file)
     if log.ending is None:
         raise WorkError(
@@ -258,7 +265,7 @@ def load_circle_report(
     )
     return CircleReport(
         task=task,
-        circle=circle_figures(truth, task),
+        circle=circle_figures(truth, task, backwards),
         estimation=estimation_figures(estimate, truth),
         loop=_loop_figures(log, first_ns, last_ns),
         frames=_frame_counts(log),

@@ -83,8 +83,14 @@ class DemoOptions:
     view: bool = False
     adapt: bool = False
     obstacle: bool = False
+    backwards: bool = False
     port: int = DEFAULT_PORT
     show_progress: bool = True
+
+    @property
+    def facing(self) -> str:
+        """What robot.toml says of it."""
+        return "backwards" if self.backwards else "forwards"
 
     @property
     def log(self) -> Path:
@@ -119,7 +125,7 @@ def run_demo(options: DemoOptions) -> CircleReport:
     with _ended_by_signals(), tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
         stopped = _drive_undisturbed(options, _write_robot_file(Path(scratch), options), console)
     task = circle_task(load_robot_config(SHIPPED_ROBOT).task, "the demonstration")
-    report = load_circle_report(options.log, options.truth, task, options.laps, stopped)
+    report = load_circle_report(options.log, options.truth, task, options.laps, stopped, options.backwards)
     if options.obstacle:
         report = replace(report, pillar=PILLAR, footprint=FOOTPRINT)
     picture_file = options.out / "circle.png"
@@ -158,7 +164,7 @@ def _write_robot_file(scratch: Path, options: DemoOptions) -> Path:
         'channel = "/tmp/disco-hw-wombot.can"': f'channel = "{scratch / "bus"}"',
         'port = "/tmp/disco-hw-wombot.tty"': f'port = "{scratch / "tty"}"',
         'file = "wombot_model.toml"': f'file = "{model}"',
-        "[control]\n": f'[control]\nuncertainty = "{options.uncertainty}"\n',
+        "[control]\n": f'[control]\nuncertainty = "{options.uncertainty}"\nfacing = "{options.facing}"\n',
     }
     for old, new in replaced.items():
         if text.count(old) != 1:
@@ -212,8 +218,9 @@ def start_pose(setup: Setup) -> tuple[float, float, float]:
     """
     task = circle_task(setup.config.task, "the demonstration")
     (_, _, x_icr_m), _ = geometry(setup.model)
-    inwards_rad = math.asin(inwards_sine(task.radius_m, x_icr_m))
-    return task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi + inwards_rad
+    turned_rad = setup.config.turned_rad
+    inwards_rad = math.asin(inwards_sine(task.radius_m, -x_icr_m if turned_rad else x_icr_m))
+    return task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi + inwards_rad + turned_rad
 
 
 def _drive(options: DemoOptions, robot_file: Path, console: Console) -> bool:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from disco_hw.config import RobotConfig
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
 from disco_hw.drive.script import ScriptSource, Unattended
@@ -164,7 +165,7 @@ def run_gap_experiment(options: GapExperimentOptions, progress: Progress = lambd
     for run, model in models.items():
         progress(f"circle with the model {run}")
         tracks[run] = _circle(setup, options, hidden, model)
-        laps[run] = _lap(tracks[run], task)
+        laps[run] = _lap(tracks[run], setup.config)
     result = GapExperimentResult(hidden, found, laps, tracks, task)
     (options.out / "experiment.json").write_text(as_json(result.as_dict(), indent=1), encoding="utf-8")
     with (options.out / "experiment.csv").open("w", newline="", encoding="utf-8") as file:
@@ -230,8 +231,8 @@ def _circle(
     return Track(*np.array(rows).T)
 
 
-def _lap(track: Track, task: CircleTask) -> Lap:
-    figures = circle_figures(track, task)
+def _lap(track: Track, config: RobotConfig) -> Lap:
+    figures = circle_figures(track, circle_task(config.task, "experiment gap"), bool(config.turned_rad))
     return Lap(
         figures.settled_mean_cost,
         figures.settled_rms_distance_m,

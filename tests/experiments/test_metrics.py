@@ -43,6 +43,12 @@ def test_a_wider_and_slower_circle_shows_both_errors():
     assert figures.mean_cost == pytest.approx(np.hypot(0.1, 0.05))
 
 
+def test_a_robot_that_is_to_drive_backwards_is_too_slow_by_what_it_rolls_forwards():
+    path = circle(speed=-0.15)
+    assert circle_figures(path, TASK, backwards=True).rms_speed_error_m_s == pytest.approx(0.05)
+    assert circle_figures(path, TASK).rms_speed_error_m_s == pytest.approx(0.35)
+
+
 def test_settled_figures_leave_out_the_first_quarter_lap():
     good, start = circle(laps=1.0, n=401), circle(radius=1.75, laps=0.2, n=11)
     later = replace(good, t_s=start.t_s[-1] + 1.0 + good.t_s)
