@@ -33,9 +33,9 @@ from disco_hw.control.plan import (
 )
 from disco_hw.control.refinement import Refinement
 from disco_hw.control.rollout_points import RolloutPoints
-from disco_hw.control.sampling import Guidance, Sampling, Stopping, ramp_to_zero
+from disco_hw.control.sampling import Guidance, Sampling, Stopping
 from disco_hw.control.state_prediction import PlanStart, StatePrediction
-from disco_hw.control.surroundings import Surroundings
+from disco_hw.control.surroundings import Surroundings, keeps_clear
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Belief, Model
 from disco_hw.tasks import PlannedTask
@@ -250,20 +250,10 @@ class Disco:
         if commands is None:
             return None
         # The refinement knows the line and nothing else: near an obstacle or a fence the sampled plan stands.
-        if not self._is_clear(begin, commands, system):
+        around, limits, step_s = self._surroundings, self._limits, self.settings.step_s
+        if around is not None and not keeps_clear(around, self._points, begin, commands, system.start, limits, step_s):
             return None
         return commands, begin.mean_path(self._points.mean_run, commands)
-
-    def _is_clear(self, begin: PlanStart, commands: Array, system: SkidSteer) -> bool:
-        """Whether a robot that does this and then stops keeps clear of the fence and obstacles under every point."""
-        if self._surroundings is None:
-            return True
-        limits, step_s, points = self._limits, self.settings.step_s, self._points
-        stop_steps = math.ceil(np.abs(commands[-1]).max() / (limits.acceleration_rad_s2 * step_s)) + 1
-        stopped = np.concatenate([commands, ramp_to_zero(commands[-1], limits, step_s, stop_steps)])
-        runs = [begin.point_path(points.run, stopped, point) for point in range(points.weights.size)]
-        x_m, y_m = (begin.state[:2] - system.start[:2]).tolist()
-        return self._surroundings.allows(np.array(runs), (x_m, y_m))
 
     def sampled_rollouts(self, count: int = 50) -> Rollouts:
         """Return the last plan's `count` sequences of the largest weight, rolled out under the mean parameters.

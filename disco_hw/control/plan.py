@@ -62,6 +62,14 @@ class CommandLimits:
         return cls(robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2)
 
 
+def ramp_to_zero(start: Array, limits: CommandLimits, step_s: float, steps: int) -> Array:
+    """Return commands (steps, 2) from `start` (2,) to zero (rad/s), as fast as the acceleration limit allows."""
+    change = limits.acceleration_rad_s2 * step_s
+    size = np.maximum(np.abs(start) - np.minimum(change, np.abs(start)) * np.arange(1, steps + 1)[:, None], 0.0)
+    ramp: Array = np.sign(start) * size
+    return ramp
+
+
 @dataclass(frozen=True, slots=True)
 class Sampler:
     """Settings that say how command sequences are sampled, weighted and carried on, in the system's units.

@@ -17,7 +17,15 @@ from disco_hw.control.kernel.avoid import TOUCH_COST
 from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.skid_steer import SkidSteer
 from disco_hw.control.optimiser import Optimiser
-from disco_hw.control.plan import Array, CommandLimits, Diagnostics, DiscoSettings, NoValidControl, PlanOutcome
+from disco_hw.control.plan import (
+    Array,
+    CommandLimits,
+    Diagnostics,
+    DiscoSettings,
+    NoValidControl,
+    PlanOutcome,
+    ramp_to_zero,
+)
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.jit import compiled_for
 
@@ -145,14 +153,6 @@ TRAPPED = (
     "no way past the fence or an obstacle was found, and the robot stops before it; clear the way, or "
     "drive it away from there"
 )
-
-
-def ramp_to_zero(start: Array, limits: CommandLimits, step_s: float, steps: int) -> Array:
-    """Return commands (steps, 2) from `start` (2,) to zero (rad/s), as fast as the acceleration limit allows."""
-    change = limits.acceleration_rad_s2 * step_s
-    size = np.maximum(np.abs(start) - np.minimum(change, np.abs(start)) * np.arange(1, steps + 1)[:, None], 0.0)
-    ramp: Array = np.sign(start) * size
-    return ramp
 
 
 class Stopping:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from statistics import NormalDist
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.control.detours import Detours
-from disco_hw.control.kernel import aligned_zeros
+from disco_hw.control.kernel import Floats, aligned_zeros
 from disco_hw.control.kernel.avoid import (
     COLUMNS,
     DETOUR_COLUMNS,
@@ -24,6 +25,9 @@ from disco_hw.control.kernel.avoid import (
     place_shapes,
     touches,
 )
+from disco_hw.control.plan import CommandLimits, ramp_to_zero
+from disco_hw.control.rollout_points import RolloutPoints
+from disco_hw.control.state_prediction import PlanStart
 from disco_hw.fence import Footprint
 from disco_hw.fence.clearance import Boundaries, circle_outline
 from disco_hw.jit import compiled_for
@@ -128,6 +132,21 @@ class Surroundings:
         self._place(*arguments)
         self._detours.place(self.area.detours, x_m, y_m, origin_m)
         return self.area
+
+
+def keeps_clear(
+    around: Surroundings, points: RolloutPoints, begin: PlanStart, commands: Array, start: Floats,
+    limits: CommandLimits, step_s: float,
+) -> bool:  # fmt: skip
+    """Whether a robot that does these commands (N, 2) and then stops keeps clear of everything under every point.
+
+    `start` (10,) is that of `SkidSteer`.
+    """
+    stop_steps = math.ceil(np.abs(commands[-1]).max() / (limits.acceleration_rad_s2 * step_s)) + 1
+    stopped = np.concatenate([commands, ramp_to_zero(commands[-1], limits, step_s, stop_steps)])
+    runs = [begin.point_path(points.run, stopped, point) for point in range(points.weights.size)]
+    origin_x_m, origin_y_m = (begin.state[:2] - start[:2]).tolist()
+    return around.allows(np.array(runs), (origin_x_m, origin_y_m))
 
 
 def _edges(bounds: Boundaries) -> Array:

@@ -35,7 +35,8 @@ from disco_hw.log.records import (
 from disco_hw.runtime import records_of_tick
 from disco_hw.runtime.assembly import apply_geometry, create_pipeline, create_planner
 from disco_hw.runtime.obstacles import Obstacles
-from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, Off, Pipeline, Silent, Source, Standstill
+from disco_hw.runtime.pipeline import FollowTask, Manual, Motion, NoPlanner, Off, Pipeline, Silent, Source, Standstill
+from disco_hw.runtime.plausibility import FOLLOWS
 from disco_hw.runtime.robot_setup import Setup, setup_of_log, task_of
 from disco_hw.runtime.safe_area import fence_of_record, report_of_record
 from drivers.types import PoseSample, Readings, WheelSample
@@ -59,6 +60,7 @@ _COMPARED = (Estimate, Innovation, Plan, Command)
 _NOT_REPLAYED = {(Command, "in_force"), (Command, "valid_for_s")}
 _FLOAT = struct.Struct("<d")
 _SOURCES = frozenset(source.value for source in Source)
+_PLANNED = frozenset(source.value for source in FOLLOWS)
 _REPLAYED = "only logs of `disco-hw run` and `drive` can be replayed"
 
 
@@ -125,7 +127,13 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
             )
         has_plans = next(iter(log.records(("/plan",))), None) is not None
         setup = _planned_as_recorded(setup_of_log(log, _REPLAYED), path, log.metadata, has_plans)
-        pipeline = create_pipeline(setup.config, setup.model, create_planner(setup.config, setup.model))
+        # What was driven by hand needs no planner, whose compilation would take longer than the replay.
+        planned = any(
+            isinstance(entry.record, Command) and entry.record.source in _PLANNED
+            for entry in log.records(("/command",))
+        )
+        planner = create_planner(setup.config, setup.model) if planned else NoPlanner()
+        pipeline = create_pipeline(setup.config, setup.model, planner)
         area = _ReplayedArea(pipeline, setup.config)
         ticks = values = 0
         difference: Difference | None = None

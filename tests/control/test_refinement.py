@@ -12,7 +12,9 @@ from msgspec import structs
 from disco_hw.control import CommandLimits, Disco, DiscoSettings, PlannerState
 from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.refinement import ACCELERATION_M, END_X_ICR, STEPS, drift_correction
-from disco_hw.control.surroundings import Surroundings
+from disco_hw.control.rollout_points import RolloutPoints
+from disco_hw.control.state_prediction import StatePrediction
+from disco_hw.control.surroundings import Surroundings, keeps_clear
 from disco_hw.fence import Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.model import Gaussian, Model
@@ -210,21 +212,49 @@ def test_a_robot_that_gets_nowhere_is_left_to_the_sampled_plan() -> None:
     assert steps[60] == STEPS
 
 
-@pytest.mark.parametrize(
-    ("room_to_stop_m", "radius_part", "is_refined"), [(0.2, 0.01, False), (0.6, 0.01, True), (0.6, 0.2, False)]
+# At 0.4 m/s a robot that brakes with 0.18 m/s^2 needs 0.44 m, and more where its wheels may be larger.
+STOPS = pytest.mark.parametrize(
+    ("room_to_stop_m", "radius_part", "is_clear"), [(0.2, 0.01, False), (0.6, 0.01, True), (0.6, 0.2, False)]
 )
-def test_a_plan_is_refined_only_if_the_robot_can_stop_after_it(
-    room_to_stop_m: float, radius_part: float, is_refined: bool
-) -> None:
-    """At 0.4 m/s a robot that brakes with 0.18 m/s^2 needs 0.44 m, and more where its wheels may be larger."""
-    speed_m_s, limits, settings = 0.4, CommandLimits(8.0, 3.0), DiscoSettings()
-    way_m, keep_m = STEPS * settings.step_s * speed_m_s, 0.05
+SPEED_M_S, BRAKING = 0.4, CommandLimits(8.0, 3.0)
+
+
+def _before_a_wall(room_to_stop_m: float, speed_m_s: float = SPEED_M_S) -> Surroundings:
+    """Return the surroundings of a robot with a wall ahead, so far behind where a refined plan ends."""
+    settings, keep_m = DiscoSettings(), 0.05
+    way_m = STEPS * settings.step_s * speed_m_s
     wall_m = FOOTPRINT.ahead + 0.5 * FOOTPRINT.length + keep_m + way_m + room_to_stop_m
     room = Fence(keep_in=((-5.0, -5.0), (wall_m, -5.0), (wall_m, 5.0), (-5.0, 5.0)))
     around = Surroundings(FOOTPRINT, keep_m, 1e-3, settings.step_s, settings.sampler.horizon, speed_m_s)
-    nearly_straight = CircleCost(0.0, 100.0, 100.0, speed_m_s)
-    planner = Disco(_believed(radius_part, 0.001), nearly_straight, settings, limits, surroundings=around)
     around.look_around(Boundaries(FOOTPRINT, room, ()), 0.0)
-    turning = speed_m_s / MODEL.wheel_radius_m
+    return around
+
+
+@STOPS
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (30.0, -20.0)])
+def test_a_robot_keeps_clear_if_it_can_stop_after_its_commands(
+    room_to_stop_m: float, radius_part: float, is_clear: bool, origin_m: tuple[float, float]
+) -> None:
+    around, settings = _before_a_wall(room_to_stop_m), DiscoSettings()
+    points = RolloutPoints(_believed(radius_part, 0.001), settings, BRAKING, 1)
+    turning = SPEED_M_S / MODEL.wheel_radius_m
+    begin = StatePrediction(points, settings, BRAKING).start(PlannerState(0, 0.0, 0.0, 0.0, turning, turning), 0, 0.0)
+    around.place(0.0, 0.0, origin_m, 1.25 * SPEED_M_S)
+    start = np.zeros(10, np.float32)
+    start[:2] = -np.array(origin_m)
+    commands = np.full((STEPS, 2), turning)
+    found = keeps_clear(around, points, begin, commands, start, BRAKING, settings.step_s)
+    assert found is is_clear
+
+
+@pytest.mark.thorough
+@STOPS
+def test_a_plan_is_refined_only_if_the_robot_can_stop_after_it(
+    room_to_stop_m: float, radius_part: float, is_clear: bool
+) -> None:
+    around, settings = _before_a_wall(room_to_stop_m), DiscoSettings()
+    nearly_straight = CircleCost(0.0, 100.0, 100.0, SPEED_M_S)
+    planner = Disco(_believed(radius_part, 0.001), nearly_straight, settings, BRAKING, surroundings=around)
+    turning = SPEED_M_S / MODEL.wheel_radius_m
     plan = planner.plan(0, PlannerState(0, 0.0, 0.0, 0.0, turning, turning))
-    assert (len(plan.wheel_speeds) == STEPS) is is_refined
+    assert (len(plan.wheel_speeds) == STEPS) is is_clear

@@ -65,6 +65,19 @@ def test_logs_from_before_planner_versions_are_still_among_them():
         assert (refined.metadata.planner, sampled.metadata.planner) == (SAME_SINCE_VERSION, 0)
 
 
+def test_what_was_driven_by_hand_is_replayed_without_a_planner(monkeypatch):
+    class PlannedError(Exception):
+        pass
+
+    def refused(*_):
+        raise PlannedError
+
+    monkeypatch.setattr("disco_hw.runtime.replay.create_planner", refused)
+    assert replay(LOGS / "drive.mcap", TOLERANCE).ok
+    with pytest.raises(PlannedError):
+        replay(LOGS / "refined.mcap", TOLERANCE)
+
+
 def test_a_changed_build_is_reported_by_tick_and_field(monkeypatch):
     def longer(parameters, left_rad, right_rad):
         return arc(parameters, 1.001 * left_rad, right_rad)
