@@ -271,12 +271,12 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def turned_rad(self) -> float:
-        """How far the robot is turned from where it drives to, while it follows its task: 0, or pi backwards."""
+        """Angle between the robot's heading and the direction it follows its task in: 0, or pi backwards."""
         return math.pi if self.control.facing == "backwards" else 0.0
 
     @property
     def task_start(self) -> tuple[float, float, float]:
-        """Where the task starts, and how the robot faces there: x, y (m), yaw (rad)."""
+        """Pose of the robot at the start of its task: x, y (m), yaw (rad)."""
         x_m, y_m, yaw_rad = self.task.course().start
         return x_m, y_m, yaw_rad + self.turned_rad
 

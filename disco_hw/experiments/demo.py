@@ -89,7 +89,7 @@ class DemoOptions:
 
     @property
     def facing(self) -> str:
-        """What robot.toml says of it."""
+        """Value of `control.facing` in robot.toml."""
         return "backwards" if self.backwards else "forwards"
 
     @property

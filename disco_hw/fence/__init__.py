@@ -50,7 +50,7 @@ class Footprint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def turned(self) -> Footprint:
-        """The same rectangle of the robot with its back called its front."""
+        """Footprint of the robot with its back called its front."""
         return Footprint(self.length, self.width, -self.ahead)
 
     def corners_m(self) -> tuple[Point, Point, Point, Point]:
