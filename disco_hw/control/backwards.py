@@ -28,6 +28,7 @@ from disco_hw.control.kernel import (
     terminal_cost,
 )
 from disco_hw.control.kernel.guide import SteeredChassis
+from disco_hw.control.kernel.sequences import Limits
 from disco_hw.tasks import Found, PlannedTask, Prepared
 
 
@@ -92,7 +93,7 @@ def turned_chassis(chassis: SteeredChassis) -> SteeredChassis:
 
 def guide_backwards(
     guide: Callable[..., None], commands: Floats, terms: BackwardsTerms, start: NDArray[np.float32],
-    chassis: SteeredChassis, before_left: float, before_right: float, limits: Any, step_s: float,
+    chassis: SteeredChassis, before_left: float, before_right: float, limits: Limits, step_s: float,
 ) -> None:  # fmt: skip
     """Fill `commands` (T, 2) as the compiled `guide` does, for a robot that drives backwards."""
     turned = turned_start(start), turned_chassis(chassis), -before_right, -before_left

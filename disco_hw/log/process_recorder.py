@@ -132,8 +132,8 @@ class ProcessRecorder:
 
     @property
     def writer_pid(self) -> int | None:
-        """The writer's process, or None while there is none."""
-        return None if self._line is None else self._keeper.pid
+        """The writer's process, or None while there is none or it is not known yet."""
+        return None if self._line is None else self._keeper.pid or None
 
     @property
     def keeper_pid(self) -> int | None:
@@ -210,7 +210,8 @@ class ProcessRecorder:
     def _await_first_writer(self) -> None:
         deadline_s = time.monotonic() + _START_PATIENCE_S
         self._launch()
-        while self._line is not None and not self._line.recording:
+        # The keeper and the writer report on lines of their own, in any order.
+        while self._line is not None and not (self._line.recording and self._keeper.pid):
             self._exchange(0)
             if self._line.ended or time.monotonic() > deadline_s or not self._keeper.alive:
                 error = self._line.status.error or (

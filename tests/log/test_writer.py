@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from itertools import count
 from pathlib import Path
 
 import msgspec
@@ -18,6 +19,7 @@ from disco_hw.log import writer
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder
 from disco_hw.log.reader import open_log
+from disco_hw.log.writer_link import KeeperLink
 from tests.log.processes import (
     RecordingProcess,
     SmallDisk,
@@ -41,6 +43,18 @@ def path(tmp_path):
 def recorder(path, request):
     request.getfixturevalue("forked_keepers")
     return ProcessRecorder(recording(path))
+
+
+@pytest.mark.usefixtures("forked_keepers")
+def test_the_writers_process_is_known_from_the_start(path, monkeypatch):
+    """Even if the keeper is heard long after the writer: who sends a signal to process 0 sends it to itself."""
+    read, calls = KeeperLink.read, count()
+    monkeypatch.setattr(KeeperLink, "read", lambda self: read(self) if next(calls) > 20 else None)
+    recorder = ProcessRecorder(recording(path))
+    assert recorder.writer_pid
+    assert alive(recorder.writer_pid)
+    recorder.close()
+    assert recorder.writer_pid is None
 
 
 def test_a_killed_writer_loses_no_more_than_what_came_since_the_last_flush(path, recorder):
