@@ -1,9 +1,11 @@
 """A GPS receiver: the vendors' own sentences, a library's, a real port and a real socket, and a reader killed."""
 
+import json
 import math
 import os
 import signal
 import socket
+import subprocess
 import time
 import tty
 from datetime import UTC, datetime, timedelta
@@ -12,7 +14,7 @@ import pytest
 
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.pose import PoseSourceError, create_pose_source
-from drivers.pose.nmea import QUALITY_STD_M, Fixes, ReceiverClock, TangentPlane
+from drivers.pose.nmea import QUALITY_STD_M, Fixes, NmeaPoses, ReceiverClock, TangentPlane
 from tests.drivers.waiting import receive_until
 from tests.runtime.simulated import simulated_stack
 
@@ -148,6 +150,21 @@ def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
 def opened(source):
     """Wait until it listens: what came before the port was open is thrown away."""
     receive_until(source, lambda _, messages: any(message.endswith(": open") for message in messages))
+
+
+def test_a_position_that_comes_while_a_tick_reads_is_not_lost():
+    """It is stamped after the tick's time, by as much as the tick was held up before it read."""
+    ours, readers = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.setblocking(False)
+    source = NmeaPoses(ours, subprocess.Popen(["true"]))
+    tick_ns = time.monotonic_ns()
+    (position,) = poses(Fixes().add_line(GGA_ALONE, time.monotonic_ns()))
+    readers.send(json.dumps(position).encode())
+    (found,) = source.receive(tick_ns, ())
+    assert found.t_ns == position["t_ns"] > tick_ns
+    assert found.t_ns <= found.received_ns <= time.monotonic_ns()
+    source.close()
+    readers.close()
 
 
 def test_over_a_serial_port_that_goes_away(create_source):
