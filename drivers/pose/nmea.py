@@ -79,8 +79,7 @@ class NmeaPoses:
                 message = b"" if self._ended else self._received()
                 if not message:
                     break
-                # The reader's clock is ours: what it has stamped since `now_ns` is not from the future.
-                pose = pose_of(message, max(now_ns, time.monotonic_ns()))
+                pose = pose_of(message, now_ns, time.monotonic_ns())
                 if isinstance(pose, PoseSample):
                     poses.append(pose)
                 elif (text := message_of(message)) is not None:

@@ -10,6 +10,7 @@ import contextlib
 import os
 import socket
 import struct
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -96,7 +97,7 @@ class BridgePoses:
     def _handle(self, datagram: bytes, sender: str, now_ns: int) -> PoseSample | None:
         if not self._senders.may_send(sender, now_ns):
             return None
-        pose = pose_of(datagram, now_ns)
+        pose = pose_of(datagram, now_ns, time.monotonic_ns())
         if isinstance(pose, PoseSample):
             self._senders.note_pose(sender, now_ns)
             return pose

@@ -133,7 +133,7 @@ class UdpPoses:
                 self._senders.refused.add(now_ns, text, "docs/poses.md describes what a sender with a key sends")
                 return None
             datagram = opened
-        pose = pose_of(datagram, now_ns)
+        pose = pose_of(datagram, now_ns, time.monotonic_ns())
         if isinstance(pose, str):
             self._senders.refused.add(now_ns, f"{sender[0]}:{sender[1]} sends no pose but {pose}", POSE_HINT)
             return None
@@ -141,8 +141,12 @@ class UdpPoses:
         return pose
 
 
-def pose_of(datagram: bytes, now_ns: int) -> PoseSample | str:
-    """Return the pose in a datagram, or in words what is there instead."""
+def pose_of(datagram: bytes, now_ns: int, read_ns: int = 0) -> PoseSample | str:
+    """Return the pose in a datagram, or in words what is there instead.
+
+    `now_ns` is the tick's time, from which `age_s` counts; `read_ns` is when the datagram was read, if later: its
+    sender may have stamped it while the tick was already running.
+    """
     is_json = datagram[:1] == b"{"
     try:
         read = _DECODERS[not is_json](datagram)
@@ -153,6 +157,7 @@ def pose_of(datagram: bytes, now_ns: int) -> PoseSample | str:
     if read.age_s is not None and math.isfinite(read.age_s):
         age_ns = round(1e9 * read.age_s)
     elif read.t_ns is not None:
+        now_ns = max(now_ns, min(read.t_ns, read_ns))
         age_ns = now_ns - read.t_ns
     else:
         return "a position without age_s or t_ns"

@@ -4,6 +4,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 
 import msgspec
 import pytest
@@ -46,6 +47,14 @@ def test_poses_come_in_the_order_of_their_times_and_the_rest_is_counted(source):
     assert source.refused == 2
     (text,) = source.new_messages()
     assert text.startswith(f"the bridge process {os.getpid()} sends no pose but what cannot be read as one (")
+
+
+def test_a_pose_that_is_stamped_while_a_tick_is_about_to_read_is_not_lost(source):
+    tick_ns = time.monotonic_ns()
+    stamped_ns = time.monotonic_ns()
+    send_datagrams(msgspec.msgpack.encode({**POSE, "t_ns": stamped_ns}))
+    assert [pose.t_ns for pose in source.receive(tick_ns, ())] == [stamped_ns]
+    assert source.refused == 0
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")

@@ -6,6 +6,7 @@ import re
 import shutil
 import socket
 import subprocess
+import time
 from pathlib import Path
 
 import msgspec
@@ -27,6 +28,26 @@ def test_a_datagram_is_a_pose_at_its_own_time(encode):
     assert (pose.t_ns, pose.received_ns) == (NOW_NS - 40_000_000, NOW_NS)
     assert (pose.x_m, pose.y_m, pose.yaw_rad, pose.position_std_m, pose.yaw_std_rad) == tuple(POSE.values())
     assert pose_of(encode({**POSE, "t_ns": NOW_NS - 7}), NOW_NS).t_ns == NOW_NS - 7
+
+
+def test_a_pose_may_be_stamped_until_it_is_read():
+    datagram = json.dumps({**POSE, "t_ns": NOW_NS + 9}).encode()
+    pose = pose_of(datagram, NOW_NS, read_ns=NOW_NS + 9)
+    assert (pose.t_ns, pose.received_ns) == (NOW_NS + 9, NOW_NS + 9)
+    assert "is -1e-09 s old" in pose_of(datagram, NOW_NS, read_ns=NOW_NS + 8)
+    older = json.dumps({**POSE, "t_ns": NOW_NS - 9}).encode()
+    assert pose_of(older, NOW_NS, read_ns=NOW_NS + 9).received_ns == NOW_NS
+
+
+def test_a_pose_that_is_stamped_while_a_tick_is_about_to_read_is_not_lost(create_source, port):
+    source = create_source("udp", port=port)
+    tick_ns = time.monotonic_ns()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        stamped_ns = time.monotonic_ns()
+        sender.sendto(json.dumps({**POSE, "t_ns": stamped_ns}).encode(), ("127.0.0.1", port))
+        assert [pose.t_ns for pose in source.receive(tick_ns, ())] == [stamped_ns]
+    assert source.refused == 0
+    source.close()
 
 
 @pytest.mark.parametrize(
