@@ -60,7 +60,7 @@ class Disco:
         surroundings: Surroundings | None = None,
     ) -> None:  # fmt: skip
         self.task, self.settings, self._surroundings = task, settings, surroundings
-        self._costed = self._seen(task)
+        self._costed = self._as_driven(task)
         self._points = points = RolloutPoints(model, settings, limits, seed)
         self._limits = limits
         self._prediction = StatePrediction(points, settings, limits)
@@ -108,10 +108,10 @@ class Disco:
         """Plan for another task of the same type from the next `plan` on; nothing is compiled. Raises TypeError."""
         if type(task) is not type(self.task):
             raise TypeError(f"the planner was compiled for {type(self.task).__name__}, not {type(task).__name__}")
-        self.task, self._costed = task, self._seen(task)
+        self.task, self._costed = task, self._as_driven(task)
         self.reset()
 
-    def _seen(self, task: PlannedTask) -> PlannedTask:
+    def _as_driven(self, task: PlannedTask) -> PlannedTask:
         """Return the task as its costs see the robot: as it is, or with its back as its front."""
         return Backwards(task) if self.settings.backwards else task
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from disco_hw.control.backwards import BackwardsTerms, guide_backwards, task_of
+from disco_hw.control.backwards import guide_backwards, task_of
 from disco_hw.control.kernel import Floats
 from disco_hw.control.kernel.avoid import TOUCH_COST
 from disco_hw.control.kernel.guide import SteeredChassis, guide
@@ -127,8 +127,8 @@ class Guidance:
         arguments = system.start, chassis, *before, optimiser.limits, step_s
         if self._guide is None:
             self._guide = compiled_for(guide, commands, terms, *arguments)
-        if isinstance(system.task, BackwardsTerms):
-            guide_backwards(self._guide, commands, system.task, *arguments)
+        if self._settings.backwards:
+            guide_backwards(self._guide, commands, terms, *arguments)
         else:
             self._guide(commands, terms, *arguments)
         return True

@@ -117,7 +117,7 @@ def test_the_guide_leads_along_the_line_backwards():
         Limits(largest, change, np.zeros(2, np.float32)),
         0.1,
     )
-    guide_backwards(compiled_for(guide, commands, terms.task, *rest), commands, terms, *rest)
+    guide_backwards(compiled_for(guide, commands, terms.task, *rest), commands, terms.task, *rest)
     places = rolled_out(commands, state, 0.1)
     assert np.abs(np.hypot(*places[20:].T) - RADIUS_M).max() < 0.005
     assert (commands.sum(axis=1) < 0.0).all()
