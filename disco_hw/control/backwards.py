@@ -95,7 +95,7 @@ def guide_backwards(
     guide: Callable[..., None], commands: Floats, terms: Terms, start: NDArray[np.float32],
     chassis: SteeredChassis, before_left: float, before_right: float, limits: Limits, step_s: float,
 ) -> None:  # fmt: skip
-    """Fill `commands` (T, 2) as the compiled `guide` does for the task's own terms, for a robot that drives backwards."""
+    """Fill `commands` (T, 2) as the compiled `guide` does for a task's terms, for a robot that drives backwards."""
     turned = turned_start(start), turned_chassis(chassis), -before_right, -before_left
     guide(commands, terms, *turned, limits, step_s)
     commands[:] = -commands[:, ::-1]

@@ -13,9 +13,10 @@ import math
 import socket
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 
 from drivers.pose import PoseSourceError, is_heading_filled_in
 from drivers.pose.senders import SILENCE_S, PoseProof, SenderGate
@@ -28,6 +29,8 @@ MOST_A_TICK = 100
 LONGEST_DATAGRAM = 1024
 # Chosen: longer than any sensor's delay; an older pose is of a clock that is not synchronised.
 OLDEST_S = 10.0
+# Chosen: above any place on earth in millimetres, and small enough to be squared.
+LARGEST = 1e12
 POSE_HINT = "docs/poses.md shows what a sender sends"
 
 
@@ -38,7 +41,7 @@ class _Datagram(msgspec.Struct, frozen=True):
     yaw_rad: float | None = None
     yaw_std_rad: float | None = None
     age_s: float | None = None
-    t_ns: int | None = None
+    t_ns: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
 
 
 class _Message(msgspec.Struct, frozen=True):
@@ -152,24 +155,25 @@ def pose_of(datagram: bytes, now_ns: int, read_ns: int = 0) -> PoseSample | str:
         read = _DECODERS[not is_json](datagram)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         return f"what cannot be read as one ({str(error)[:80]})"
-    if not all(map(math.isfinite, (read.x_m, read.y_m, read.position_std_m))) or read.position_std_m < 0.0:
+    is_place = abs(read.x_m) <= LARGEST and abs(read.y_m) <= LARGEST
+    if not is_place or not 0.0 <= read.position_std_m <= LARGEST:
         return "a position or a standard deviation that cannot be"
     if read.age_s is not None and math.isfinite(read.age_s):
-        age_ns = round(1e9 * read.age_s)
+        age_s = read.age_s
     elif read.t_ns is not None:
         now_ns = max(now_ns, min(read.t_ns, read_ns))
-        age_ns = now_ns - read.t_ns
+        age_s = (now_ns - read.t_ns) * 1e-9
     else:
         return "a position without age_s or t_ns"
-    if not 0 <= age_ns <= OLDEST_S * 1e9:
-        return f"one that is {age_ns * 1e-9:.3g} s old by this computer's clock, not 0 to {OLDEST_S:g} s"
+    if not 0.0 <= age_s <= OLDEST_S:
+        return f"one that is {age_s:.3g} s old by this computer's clock, not 0 to {OLDEST_S:g} s"
     if (read.yaw_rad is None) != (read.yaw_std_rad is None):
         return "half a heading: yaw_rad and yaw_std_rad go together"
     yaw_rad = math.nan if read.yaw_rad is None else read.yaw_rad
     yaw_std_rad = math.nan if read.yaw_std_rad is None else read.yaw_std_rad
-    if not is_heading_filled_in(yaw_rad, yaw_std_rad):
+    if not is_heading_filled_in(yaw_rad, yaw_std_rad) or max(abs(yaw_rad), yaw_std_rad) > LARGEST:
         yaw_rad = yaw_std_rad = math.nan
-    return PoseSample(now_ns - age_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
+    return PoseSample(now_ns - round(1e9 * age_s), now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
 
 
 def message_of(datagram: bytes) -> str | None:

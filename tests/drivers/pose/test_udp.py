@@ -62,6 +62,13 @@ def test_a_pose_that_is_stamped_while_a_tick_is_about_to_read_is_not_lost(create
         ({"age_s": 0.0, "x_m": None}, "Expected `float`, got `null`"),
         ({"age_s": 0.0, "yaw_rad": None}, "half a heading"),
         ({"age_s": 0.0, "yaw_std_rad": None}, "half a heading"),
+        # Numbers that are numbers, and too large to be turned into integers or to be squared.
+        ({"age_s": 1e300}, "is 1e+300 s old"),
+        ({"t_ns": 10**400}, "Expected `int` <= 9223372036854775807"),
+        ({"t_ns": -(10**400)}, "Expected `int` >= 0"),
+        ({"age_s": 0.0, "position_std_m": 1e200}, "a standard deviation that cannot be"),
+        ({"age_s": 0.0, "x_m": -1e200}, "a position or a standard deviation that cannot be"),
+        ({"age_s": 0.0, "y_m": 1e200}, "a position or a standard deviation that cannot be"),
     ],
 )
 def test_of_what_is_no_pose_of_now_it_is_said_why(change, text):
@@ -81,6 +88,8 @@ def test_a_position_without_heading_is_one_and_says_so(encode):
         ({}, True),
         ({"yaw_std_rad": -1.0}, False),
         ({"yaw_std_rad": math.nan}, False),
+        ({"yaw_std_rad": 1e200}, False),
+        ({"yaw_rad": -1e200}, False),
         ({"yaw_rad": math.nan}, False),
         ({"yaw_rad": 0.0, "yaw_std_rad": 0.0}, False),
         ({"yaw_rad": 0.0}, True),
