@@ -81,6 +81,8 @@ _POLL_S = 0.01
 _OPEN_S = 2.0
 # Chosen: longer than the pause of any device that sends by itself, which a question would disturb.
 _SILENT_S = 0.3
+# Chosen: longer than a busy computer keeps a process waiting; there are few questions.
+_PATIENT_S = 0.1
 # Chosen: some seconds of a full bus at 500 kbit/s; a kind of controller shows within far fewer.
 _MOST_FRAMES = 20_000
 
@@ -179,9 +181,9 @@ def query_line(port: str, driver: MotorDriver) -> FoundController | None:
                     return None
                 connection = ExchangeConnection(line, TransportCounters(), exchange)
                 replies = [connection.exchange(frame) for frame in driver.questions.frames]
-                # A computer that was busy just then has missed a reply: who was silent is asked once more.
+                # A computer that was busy just then has missed a reply: who was silent is asked again, and waited for.
                 silent = [frame for frame, reply in zip(driver.questions.frames, replies, strict=True) if reply is None]
-                replies += [connection.exchange(frame) for frame in silent]
+                replies += [connection.exchange(frame, _PATIENT_S) for frame in silent]
         except (serial.SerialException, OSError) as error:
             raise InputError(f"--link: {medium.explain(error)}") from None
         fields = driver.recognise([frame for frame in replies if frame is not None])

@@ -167,8 +167,8 @@ class ExchangeConnection:
         if reply is not None:
             self._replies.put(ReceivedFrame(time.monotonic_ns(), reply))
 
-    def exchange(self, frame: Frame) -> Frame | None:
-        """Send one request and wait for its reply, for a bounded time; one that does not come is counted.
+    def exchange(self, frame: Frame, timeout_s: float | None = None) -> Frame | None:
+        """Send one request and wait for its reply; one that does not come in the protocol's time, or this, is counted.
 
         Raises TransmitBusyError if the line takes no more, and what pyserial raises when unplugged.
         """
@@ -184,7 +184,7 @@ class ExchangeConnection:
             raise TransmitBusyError(_FULL) from error
         if not self._exchange.is_answered(frame):
             return None
-        reply = self._wait_for_reply(frame, len(request))
+        reply = self._wait_for_reply(frame, len(request), timeout_s or self._exchange.timeout_s)
         if reply is None:
             self._rest()
         return reply
@@ -196,10 +196,10 @@ class ExchangeConnection:
     def _rest(self) -> None:
         self._quiet_until_ns = time.monotonic_ns() + round(self._exchange.quiet_s * 1e9)
 
-    def _wait_for_reply(self, frame: Frame, sent_bytes: int) -> Frame | None:
+    def _wait_for_reply(self, frame: Frame, sent_bytes: int, timeout_s: float) -> Frame | None:
         received = b""
         byte_s = BITS_PER_BYTE / self._port.baudrate
-        deadline = time.monotonic() + self._exchange.timeout_s + sent_bytes * byte_s
+        deadline = time.monotonic() + timeout_s + sent_bytes * byte_s
         latest = deadline + _LONGEST_REPLY * byte_s
         while time.monotonic() < deadline and len(received) <= _LONGEST_REPLY:
             more = self._port.read(max(1, self._port.in_waiting))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import select
 import threading
+import time
 import tty
 from contextlib import contextmanager
 from pathlib import Path
@@ -104,7 +105,7 @@ def test_what_no_robot_is_like_is_refused_and_nothing_is_left(tmp_path):
 
 
 @contextmanager
-def line_with(*boards, chatter=b""):
+def line_with(*boards, chatter=b"", late_s=0.0):
     """A serial port with these boards at its other end; its name, and all that they have heard."""
     robot, host = os.openpty()
     tty.setraw(host)
@@ -118,6 +119,7 @@ def line_with(*boards, chatter=b""):
                 continue
             received = os.read(robot, 4096)
             received_bytes.extend(received)
+            time.sleep(late_s)
             for board in boards:
                 os.write(robot, board.receive(0, received))
 
@@ -155,6 +157,13 @@ def test_a_roboclaw_is_found_by_its_version_and_by_nothing_that_moves_or_writes(
     assert {address for address in everyone if address not in addresses} <= set(queried[len(everyone) :])
     assert bytes(received_bytes) == b"".join(bytes((address, version)) for address in queried)
     assert not any(board.obeyed for board in boards)
+
+
+def test_a_board_whose_replies_come_late_to_a_busy_computer_is_found_at_its_own_speed(tmp_path):
+    """Later than in the protocol, as to a process that is not run for a while: the other speeds are not its own."""
+    with line_with(Roboclaw(), late_s=0.06) as (port, _received):
+        link = load_robot_config(from_line(tmp_path, port, is_interactive=True)).link
+    assert (link.driver, link.baud) == ("roboclaw", 115_200)
 
 
 def test_a_silent_line_is_asked_only_with_somebodys_leave(tmp_path):
