@@ -170,6 +170,10 @@ class Driver(Protocol):
     def clock_offset_ns(self) -> int | None:
         """Host time minus device time, as estimated now; None before the first estimate."""
 
+    @property
+    def is_stop_over(self) -> bool:
+        """Whether no further frame would bring the wheels to a stand: they stand, or the robot cannot be reached."""
+
     def link_up(self, now_ns: int) -> None:
         """Start the handshake, because the medium has come up (again); any session is void."""
 

@@ -27,8 +27,8 @@ from drivers.types import Request
 _SECOND_NS = 1_000_000_000
 _RECORDER_NS = _SECOND_NS // 10
 _COLLECT_NS = 5 * _SECOND_NS
-# Chosen: longer than a stop by the ramp takes from usual speeds; afterwards the e-stop, and the robot's own watchdog.
-_STOP_LIMIT_NS = 1_500_000_000
+# Chosen: for a stop beside its ramp, as for the brake after it; afterwards the e-stop, and the robot's own watchdog.
+_STOP_LIMIT_S = 1.5
 _FAN_NS = _SECOND_NS
 _WATCHED_FAN_NS = _SECOND_NS // 2
 # Chosen: enough to see where the plans go; each costs time of the tick and space in the log.
@@ -104,43 +104,54 @@ class Daemon:
         return 0
 
     def stop_wheels(self) -> None:
-        """Bring the robot to a stand and disarm it, within 1.5 s; after a failure by the shortest way there is.
+        """Bring the robot to a stand and disarm it; after a failure of the loop by its driver alone.
 
-        Whatever this achieves, the robot's own watchdog stops it when the frames cease.
+        What does not stand 1.5 s after the ramp from its top speed is over gets the e-stop. Whatever this achieves,
+        the robot's own watchdog stops it when the frames cease.
         """
         self._notifier.stopping()
-        if self._failed:
-            self._send_stop()
-            return
-        deadline_ns = self._clock.now_ns() + _STOP_LIMIT_NS
-        period_ns = round(1e9 / self._core.config.control.rate_hz)
-        requests: tuple[UserRequest, ...] = (UserRequest.DISARM,)
-        while (now_ns := self._clock.now_ns()) < deadline_ns:
+        if not self._failed:
             try:
-                tick = self._core.tick(now_ns, requests)
+                self._until_stopped(lambda now_ns: self._core.tick(now_ns, (UserRequest.DISARM,)))
             except Exception:
-                # Even where the tick itself fails while stopping, a stop is sent to the robot before that is passed on.
-                self._send_stop()
+                # Even where the tick itself fails while stopping, the driver stops the robot before that is passed on.
+                self._until_stopped(self._stop_by_driver)
                 raise
-            requests = ()
-            if tick.output.state not in IN_USE:
+            return
+        self._until_stopped(self._stop_by_driver)
+
+    def _until_stopped(self, tick: Callable[[int], object]) -> None:
+        """Call `tick` with the time once a period until the driver's stop is over; send the e-stop if that fails."""
+        core, limits = self._core, self._core.driver.limits
+        ramp_s = 0.0
+        if limits is not None:
+            ramp_s = core.config.robot.max_wheel_speed_rad_s / limits.stop_deceleration_rad_s2.value
+        deadline_ns = self._clock.now_ns() + round((_STOP_LIMIT_S + ramp_s) * 1e9)
+        period_ns = round(1e9 / core.config.control.rate_hz)
+        while (now_ns := self._clock.now_ns()) < deadline_ns:
+            tick(now_ns)
+            if core.driver.is_stop_over:
                 return
             self._clock.sleep_until_ns(now_ns + period_ns)
-        self._send_stop()
+        self._send_estop()
 
-    def _send_stop(self) -> None:
-        """Ask for standby by the driver alone, and by the e-stop if the driver cannot."""
-        core, now_ns = self._core, self._clock.now_ns()
+    def _stop_by_driver(self, now_ns: int) -> None:
+        """Have the driver alone stop the robot, as the rest of the loop has failed; by the e-stop if it cannot."""
+        driver, transport = self._core.driver, self._core.transport
         try:
-            core.driver.request(Request.STANDBY)
-            frames = core.driver.transmit(now_ns, None)
+            driver.receive(now_ns, transport.receive())
+            driver.request(Request.STANDBY)
+            frames = driver.transmit(now_ns, None)
         except Exception:
-            # A driver that cannot even ask for standby has one frame left that needs no state.
-            for frame in core.driver.estop(now_ns):
-                core.transport.send(frame, now_ns)
+            self._send_estop()
             raise
         for frame in frames:
-            core.transport.send(frame, now_ns)
+            transport.send(frame, now_ns)
+
+    def _send_estop(self) -> None:
+        now_ns = self._clock.now_ns()
+        for frame in self._core.driver.estop(now_ns):
+            self._core.transport.send(frame, now_ns)
 
     def _tick(self, now_ns: int) -> None:
         mark = self._loop.stages.mark

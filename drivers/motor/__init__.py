@@ -152,6 +152,11 @@ class RewiredDriver:
         """Offset from the controller's clock to the host's monotonic clock, in ns, from the wrapped driver."""
         return self._driver.clock_offset_ns
 
+    @property
+    def is_stop_over(self) -> bool:
+        """Whether the stop of the wrapped driver is over."""
+        return self._driver.is_stop_over
+
     def link_up(self, now_ns: int) -> None:
         """Tell the wrapped driver that the link is up."""
         self._driver.link_up(now_ns)

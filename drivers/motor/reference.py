@@ -115,6 +115,11 @@ class ReferenceDriver:
         self._foreign_reported = False
 
     @property
+    def is_stop_over(self) -> bool:
+        """Whether the robot has left the armed state, or cannot be reached; it ends every stop by itself."""
+        return self.state not in (DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING)
+
+    @property
     def state(self) -> DriverState:
         """State of the driver with its robot."""
         if not self._link_is_up:

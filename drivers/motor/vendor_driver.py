@@ -245,6 +245,12 @@ class VendorDriver:
         """Limits of the controllers, and who states them; None before they are known."""
         return None if self._port.identity is None else self._port.limits
 
+    @property
+    def is_stop_over(self) -> bool:
+        """Whether nothing more is sent to stop: controllers are at rest and not energised, or the link is down."""
+        permit = self._permit
+        return not permit.link_is_up or (permit.stage is Stage.REST and not self._port.seen.energised)
+
     def link_up(self, now_ns: int) -> None:
         """Start again after the medium has come up: whatever was agreed is void."""
         self._restart_handshake(self._permit.linked(True), now_ns)

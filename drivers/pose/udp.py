@@ -173,7 +173,8 @@ def pose_of(datagram: bytes, now_ns: int, read_ns: int = 0) -> PoseSample | str:
     yaw_std_rad = math.nan if read.yaw_std_rad is None else read.yaw_std_rad
     if not is_heading_filled_in(yaw_rad, yaw_std_rad) or max(abs(yaw_rad), yaw_std_rad) > LARGEST:
         yaw_rad = yaw_std_rad = math.nan
-    return PoseSample(now_ns - round(1e9 * age_s), now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
+    t_ns = now_ns - round(1e9 * age_s)
+    return PoseSample(t_ns, now_ns, read.x_m, read.y_m, yaw_rad, read.position_std_m, yaw_std_rad)
 
 
 def message_of(datagram: bytes) -> str | None:

@@ -1,0 +1,138 @@
+"""How the wheels stop when the daemon ends, on every vendor's simulated controllers and in simulated time."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from disco_hw.daemon.daemon import Daemon
+from disco_hw.log.recorder import NullRecorder
+from disco_hw.runtime import State
+from disco_hw.runtime.assembly import assemble_core, create_pipeline, driver_of
+from disco_hw.runtime.pipeline import Manual, NoPlanner
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
+from drivers.motor import find_driver
+from drivers.transport.inprocess import connect_pair
+from drivers.types import Frame, OutgoingFrame
+from sim.devices import find_controller
+from tests.drivers.motor.vendor_rig import START_NS, TICKS_PER_REV, VendorRig
+
+MS = 1_000_000
+# The fastest that the example of each driver allows, with wheels of 0.06 m.
+SPEEDS_RAD_S = {"agilex": 24.0, "odrive": 11.0, "roboclaw": 5.0, "ros2_base": 24.0, "vesc": 11.0}
+SLOW = {"odrive": "stop_deceleration_rad_s2 = 4.0", "vesc": "stop_deceleration_rad_s2 = 4.0"}
+
+
+class Driven:
+    """A vendor's robot under the daemon's core; the clock of a daemon, which lets its wheels turn on."""
+
+    def __init__(self, folder, name, lines="", coasting_s=3.0):
+        driver, speed_rad_s = find_driver(name), SPEEDS_RAD_S[name]
+        file = folder / "robot.toml"
+        file.write_text(
+            f'[robot]\nname = "r"\nwheel_radius_m = 0.06\naxial_distance_m = 0.31\nticks_per_rev = {TICKS_PER_REV}\n'
+            f"max_wheel_speed_rad_s = {speed_rad_s}\n"
+            f'[link]\ndriver = "{name}"\nkind = "{driver.kinds[0]}"\n{driver.example}\n{lines}\n'
+        )
+        setup = load_setup(file)
+        config = setup.config
+        self.host, self.robot = connect_pair()
+        self.host.open()
+        self.robot.open()
+        settings = config.link.settings()
+        exchange = driver.exchange(settings) if driver.kinds[0] == "serial" else None
+        self.rig = VendorRig(find_controller(name)(settings, TICKS_PER_REV), exchange, coasting_s)
+        pipeline = create_pipeline(config, setup.model, NoPlanner())
+        self.core = assemble_core(
+            config, self.host, driver_of(config), pipeline, NullRecorder(), needs_pose=False, adaptation=None
+        )
+        self.core.directions = None
+        self._now_ns = START_NS
+        self.motion = Manual(speed_rad_s, speed_rad_s)
+        self.daemon = Daemon(
+            self.core, None, SimpleNamespace(poll=lambda: None), self, SimpleNamespace(received=None),
+            lambda *_text: None, SimpleNamespace(done=False),
+        )  # fmt: skip
+
+    def now_ns(self):
+        return self._now_ns
+
+    def sleep_until_ns(self, deadline_ns):
+        while self._now_ns < deadline_ns:
+            self._now_ns += MS
+            for received in self.robot.receive():
+                self.rig.receive(self._now_ns, received.frame)
+            self.rig.step(self._now_ns)
+            for frame in self.rig.drain():
+                sent = Frame(frame.can_id, frame.data, frame.extended)
+                self.robot.send(OutgoingFrame(sent, self._now_ns + MS), self._now_ns)
+
+    def run(self, duration_s, *requests):
+        for _ in range(round(50 * duration_s)):
+            tick = self.core.tick(self._now_ns, requests, motion=self.motion, by_hand=True)
+            requests = ()
+            self.sleep_until_ns(self._now_ns + 20 * MS)
+        return tick
+
+    def drive(self):
+        self.run(1.0)
+        self.run(1.0, UserRequest.ARM)
+        tick = self.run(3.5, UserRequest.START)
+        assert (tick.output.state, tick.output.running) == (State.ARMED, True), tick.output.detail
+        assert self.rig.speed_rad_s == pytest.approx(self.motion.left_rad_s, rel=0.02)
+
+
+@pytest.fixture(params=SPEEDS_RAD_S)
+def name(request):
+    return request.param
+
+
+def fails(*_arguments, **_options):
+    raise RuntimeError("planted")
+
+
+def test_without_a_fault_they_stand_before_it_ends_however_fast_they_were(tmp_path, name):
+    driven = Driven(tmp_path, name, SLOW.get(name, ""))
+    driven.drive()
+    driven.daemon.stop_wheels()
+    assert driven.rig.speed_rad_s < 0.5
+
+
+def test_after_a_failure_of_the_loop_the_driver_alone_brings_them_to_a_stand(tmp_path, name):
+    driven = Driven(tmp_path, name)
+    driven.drive()
+    driven.core.tick = fails
+    driven.daemon._failed = True
+    driven.daemon.stop_wheels()
+    assert driven.rig.speed_rad_s < 0.5
+
+
+def test_where_the_tick_fails_while_they_stop_the_driver_goes_on_and_the_failure_is_passed_on(tmp_path, name):
+    driven = Driven(tmp_path, name)
+    driven.drive()
+    driven.core.tick = fails
+    with pytest.raises(RuntimeError, match="planted"):
+        driven.daemon.stop_wheels()
+    assert driven.rig.speed_rad_s < 0.5
+
+
+def test_where_the_driver_fails_too_the_last_frames_are_those_of_an_emergency_stop(tmp_path, name):
+    driven = Driven(tmp_path, name, coasting_s=0.2)
+    driven.drive()
+    driven.daemon._failed = True
+    driven.core.driver.transmit = fails
+    with pytest.raises(RuntimeError, match="planted"):
+        driven.daemon.stop_wheels()
+    speed_rad_s = driven.rig.speed_rad_s
+    driven.sleep_until_ns(driven.now_ns() + 1500 * MS)
+    assert driven.rig.speed_rad_s < 0.05 * speed_rad_s
+
+
+def test_an_emergency_stop_goes_on_while_they_turn_where_they_brake_only_as_long_as_they_are_told_to(tmp_path):
+    driven = Driven(tmp_path, "vesc", coasting_s=0.5)
+    driven.drive()
+    driven.rig.stuck = {0, 1}
+    driven.run(0.1, UserRequest.ESTOP)
+    assert driven.rig.speed_rad_s > 8.0
+    driven.daemon.stop_wheels()
+    assert driven.rig.speed_rad_s < 0.5
