@@ -6,6 +6,7 @@ own fields in [link], or the controller's settings, have right needs nothing her
 
 from __future__ import annotations
 
+import dataclasses
 import pkgutil
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -113,6 +114,8 @@ class Wiring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 AS_CONFIGURED = Wiring()
+# Limits of a controller that count its own turns; `ticks_per_rev` is of the controller on both sides.
+_OF_WHEELS = ("max_wheel_speed_rad_s", "max_wheel_acceleration_rad_s2", "stop_deceleration_rad_s2")
 
 
 class RewiredDriver:
@@ -139,8 +142,16 @@ class RewiredDriver:
 
     @property
     def limits(self) -> Limits | None:
-        """Limits of the controller, from the wrapped driver."""
-        return self._driver.limits
+        """Limits of the controller, from the wrapped driver, in true turns of the wheels."""
+        limits = self._driver.limits
+        if limits is None:
+            return None
+        of_wheels = {
+            name: dataclasses.replace(limit, value=self._wiring.turn_ratio * limit.value)
+            for name, limit in limits.known().items()
+            if name in _OF_WHEELS
+        }
+        return dataclasses.replace(limits, **of_wheels)
 
     @property
     def stats(self) -> DriverStats:

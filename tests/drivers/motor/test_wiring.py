@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
 from drivers.motor import AS_CONFIGURED, Wiring, create_driver, rewired
-from drivers.types import DriverState, MotorSample, Readings, WheelCommand, WheelSample
+from drivers.types import DriverState, Limit, Limits, MotorSample, Readings, WheelCommand, WheelSample
 
 
 class Miswired:
@@ -57,6 +58,23 @@ def test_whatever_the_wiring_the_wheels_do_what_is_asked_and_say_what_they_do(wi
     assert controller.true == pytest.approx((0.5, -0.3))
     assert (reported.left_speed_rad_s, reported.right_speed_rad_s) == pytest.approx((0.5, -0.3))
     assert (reported.left_angle_rad, reported.right_angle_rad) == pytest.approx((5.0, -3.0))
+
+
+def test_limits_are_those_of_the_true_wheels_and_nobody_s_stay_nobody_s():
+    controller = Miswired(Wiring(turn_ratio=0.25))
+    controller.limits = Limits(
+        max_wheel_speed_rad_s=Limit(24.0, "controller"),
+        command_timeout_s=Limit(0.1, "robot.toml"),
+        stop_deceleration_rad_s2=Limit(10.0, "robot.toml"),
+        ticks_per_rev=Limit(4096.0, "controller"),
+    )
+    assert rewired(controller, controller.wiring).limits == replace(
+        controller.limits,
+        max_wheel_speed_rad_s=Limit(6.0, "controller"),
+        stop_deceleration_rad_s2=Limit(2.5, "robot.toml"),
+    )
+    controller.limits = None
+    assert rewired(controller, controller.wiring).limits is None
 
 
 def test_currents_change_sides_with_the_motors():
