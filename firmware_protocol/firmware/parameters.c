@@ -69,6 +69,14 @@ static bool in_range(const parameter_t *parameter, float value)
     return (value >= parameter->minimum) && (value <= parameter->maximum);
 }
 
+/* What a parameter may be depends on others too: a board must not keep what it refuses at its next start. */
+static bool config_holds(const disco_firmware_t *core, const parameter_t *parameter, float value)
+{
+    disco_config_t written = core->config;
+    *slot(&written, parameter->key) = value;
+    return disco_config_valid(&written);
+}
+
 static uint8_t judge_write(const disco_firmware_t *core, const parameter_t *parameter, float value)
 {
     uint8_t status = DISCO_STATUS_OK;
@@ -76,7 +84,7 @@ static uint8_t judge_write(const disco_firmware_t *core, const parameter_t *para
         status = DISCO_STATUS_READ_ONLY;
     } else if (!disco_finite(value)) {
         status = DISCO_STATUS_NOT_FINITE;
-    } else if (!in_range(parameter, value)) {
+    } else if (!in_range(parameter, value) || !config_holds(core, parameter, value)) {
         status = DISCO_STATUS_OUT_OF_RANGE;
     } else if (!disarmed(core)) {
         status = DISCO_STATUS_REFUSED_ARMED;
@@ -165,6 +173,7 @@ bool disco_record_unpack(const uint8_t *record, disco_config_t *config)
             *slot(&taken, key) = value;
         }
     }
+    sound = sound && disco_config_valid(&taken);
     if (sound) {
         *config = taken;
     }

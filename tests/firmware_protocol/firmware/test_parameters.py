@@ -1,5 +1,6 @@
 import math
 import struct
+from dataclasses import replace
 
 import pytest
 
@@ -40,13 +41,21 @@ def test_every_key_of_the_table_can_be_read():
 @pytest.mark.parametrize("name", BOUNDS)
 def test_write_within_bounds_is_read_back(name):
     key = CODEC.choice_value("PARAM_REQUEST", "key", name)
-    bench = Bench()
+    # A battery of so many volts that no other limit is in the way.
+    bench = Bench(replace(CONFIG, over_voltage_v=100.0))
     for value in BOUNDS[name]:
         assert request_parameter(bench, "WRITE", key, value) == ("OK", key, value)
         assert request_parameter(bench, "READ", key) == ("OK", key, value)
     low, high = BOUNDS[name]
     for value in (low * 0.999, high * 1.001, -1.0):
         assert request_parameter(bench, "WRITE", key, value) == ("OUT_OF_RANGE", key, high)
+
+
+def test_what_the_board_would_refuse_at_its_next_start_is_refused():
+    key, bench = CODEC.choice_value("PARAM_REQUEST", "key", "UNDER_VOLTAGE"), Bench()
+    highest = CONFIG.over_voltage_v
+    assert request_parameter(bench, "WRITE", key, highest + 0.1) == ("OUT_OF_RANGE", key, CONFIG.under_voltage_v)
+    assert request_parameter(bench, "WRITE", key, highest) == ("OK", key, highest)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
@@ -176,8 +185,19 @@ def test_what_was_never_written_is_not_taken(record):
         (21, struct.pack("<f", math.inf)),
         (21, struct.pack("<f", 0.9)),
         (21, struct.pack("<f", 655.5)),
+        (15, struct.pack("<f", 30.5)),
     ],
-    ids=["format", "unknown key", "high byte of the key", "read-only key", "nan", "inf", "too little", "too much"],
+    ids=[
+        "format",
+        "unknown key",
+        "high byte of the key",
+        "read-only key",
+        "nan",
+        "inf",
+        "too little",
+        "too much",
+        "least voltage above the largest",
+    ],
 )
 def test_a_well_sealed_record_of_nonsense_changes_nothing(at, value):
     record = packed(**OTHER)
