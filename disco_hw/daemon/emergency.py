@@ -40,6 +40,8 @@ _HINT = (
     "own e-stop button, now"
 )
 
+_BY_REFERENCE = ", and the reference controller's protocol, which no other controller understands"
+
 
 @dataclass(frozen=True, slots=True)
 class EstopOutcome:
@@ -77,7 +79,7 @@ class EstopOutcome:
     def as_text(self) -> str:
         """Return the outcome as text."""
         lines = [
-            *([] if self.file_error is None else [f"{self.file_error}: only --link was used"]),
+            *([] if self.file_error is None else [f"{self.file_error}: only --link was used{_BY_REFERENCE}"]),
             f"{self.link}: {self.link_error or 'e-stop sent'}",
             *(f"daemon: {line}" for line in self.passed_over),
             f"daemon: {self.daemon_error or 'e-stop accepted'}",

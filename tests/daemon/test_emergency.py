@@ -190,6 +190,7 @@ def test_without_a_file_that_can_be_read_the_option_says_where_the_link_is(tmp_p
     assert (outcome.link, outcome.link_error) == (f"virtual {tmp_path}", None)
     assert str(path) in outcome.file_error
     assert f"{path}: " in outcome.as_text()
+    assert "only --link was used, and the reference controller's protocol, which no other" in outcome.as_text()
     assert outcome.as_dict()["file_error"] == outcome.file_error
 
 
