@@ -283,6 +283,9 @@ class Fixes:
 
     def _handle_position(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
         quality, time_s = message.quality, _time_of_day_s(message.time)
+        if quality != self._quality and self._gst is not None and self._gst[0] != time_s:
+            # It was of the quality before.
+            self._gst = None
         notes = self._quality_messages(quality)
         if quality not in QUALITY_STD_M:
             return notes

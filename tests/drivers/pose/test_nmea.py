@@ -115,6 +115,21 @@ def test_the_deviation_follows_the_quality():
         assert pose["position_std_m"] == std_m
 
 
+def test_the_deviation_of_one_quality_is_not_that_of_another():
+    """GST at 1 Hz, before or after the GGA of its time."""
+
+    def deviation(*lines):
+        return poses(parsed(*lines))[-1]["position_std_m"]
+
+    fine, rough = sentence("GNGST,092725.00,,,,,0.014,0.012,0.03"), sentence("GNGST,092725.20,,,,,2.0,4.0,5.0")
+    single, single_later = fix(1, time="092725.20"), fix(1, time="092725.40")
+    assert deviation(fix(4), fine, fix(4, time="092725.20")) == 0.014
+    assert deviation(fix(4), fine, single) == pytest.approx(3.0 * 1.01)
+    assert deviation(fix(4), fine, single, single_later) == pytest.approx(3.0 * 1.01)
+    assert deviation(fix(4), fine, fix(0, time="092725.20"), fix(4, time="092725.40")) == pytest.approx(0.02 * 1.01)
+    assert deviation(fix(4), fine, rough, single) == deviation(fix(4), fine, single, rough, single_later) == 4.0
+
+
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
 def test_a_heading_goes_with_the_position_of_the_same_burst(order):
     """Clockwise from north; the position is given as soon as it is clear that no heading comes."""
