@@ -92,6 +92,39 @@ def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
     assert poses(Fixes().add_line(broken, NOW_NS)) == []
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "GNTHS,77.520",
+        "GNHDT",
+        "GNGST,092725.00.1.0y0.02,0.01,45.0,0.014,0.012,0.03",
+        "GNGGA,092725.00",
+        "GNGGA,092725.00,4717.11399,N,00833.91590,E,4",
+        "GNGGA,092725.00,4717.11399,N,00833.91590,E,4,08,1.01,499.6,M",
+    ],
+)
+def test_a_sentence_that_lacks_fields_is_malformed_and_changes_nothing(text):
+    fixes, whole = Fixes(), Fixes()
+    assert fixes.add_line(sentence(text), NOW_NS) == []
+    assert fixes.malformed == 1
+    assert fixes.add_line(GGA_ALONE, NOW_NS) == whole.add_line(GGA_ALONE, NOW_NS)
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["4717.e113979,N,00833.91590,E", "4717.e300,N,00833.91590,E", "9001.0,S,00833.91590,E", "4717.11399,N,18001.0,W",
+     "nan17.1,N,00833.91590,E"],
+)  # fmt: skip
+def test_what_is_no_place_on_earth_is_no_position(place):
+    found = parsed(fix(4, place=place), fix(4))
+    assert [(pose["x_m"], pose["y_m"]) for pose in poses(found)] == [pytest.approx((0.0, 0.0), abs=1e-6)]
+
+
+@pytest.mark.parametrize("altitude", ["nan", "inf", "1e300", "-1e200"])
+def test_an_altitude_that_is_none_is_as_if_there_were_none(altitude):
+    assert parsed(fix(4, altitude), fix(4)) == parsed(fix(4, ""), fix(4))
+
+
 def test_a_datum_of_another_town_is_said():
     fixes = Fixes(datum=(47.0, 8.5))
     messages = [each["said"] for each in fixes.add_line(GGA_ALONE, NOW_NS) if "said" in each]
