@@ -198,18 +198,20 @@ class ReceiverClock:
 
     def __init__(self) -> None:
         self._offsets: deque[tuple[float, float]] = deque()
-        self._days, self._last_s = 0.0, 0.0
+        self._days, self._last_s, self._last_arrival_s = 0.0, 0.0, 0.0
 
     def host_ns(self, time_of_day_s: float, arrival_ns: int) -> int:
         """Return when a fix of this time was true, at the latest."""
-        if time_of_day_s < self._last_s - 0.5 * DAY_S:
+        step_s, arrival_s = time_of_day_s - self._last_s, arrival_ns * 1e-9
+        if step_s < -0.5 * DAY_S:
             self._days += DAY_S
-        elif abs(time_of_day_s - self._last_s) > 0.5:
-            # The receiver has found its time anew, or was away: nothing is known of its clock.
+        elif step_s <= 0.0 and arrival_s - self._last_arrival_s - step_s > 0.5:
+            # The receiver has set its time back: the offsets before are too small. A line that is late goes on in time,
+            # and a time that is set forward has the smallest offset at once.
             self._offsets.clear()
-        self._last_s = time_of_day_s
+        self._last_s, self._last_arrival_s = time_of_day_s, arrival_s
         receiver_s = self._days + time_of_day_s
-        self._offsets.append((receiver_s, arrival_ns * 1e-9 - receiver_s))
+        self._offsets.append((receiver_s, arrival_s - receiver_s))
         while receiver_s - self._offsets[0][0] > _CLOCK_WINDOW_S:
             self._offsets.popleft()
         return min(arrival_ns, round(1e9 * (receiver_s + min(offset for _, offset in self._offsets))))

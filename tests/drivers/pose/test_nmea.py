@@ -195,6 +195,27 @@ def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     assert night.host_ns(18.0, 2 * 10**9) == 2 * 10**9
 
 
+@pytest.mark.parametrize("period_s", [0.1, 1.0])
+@pytest.mark.parametrize("start_s", [43_200.0, 86_395.0])
+def test_the_receivers_time_is_used_at_every_rate_and_over_midnight_and_a_silence(period_s, start_s):
+    clock = ReceiverClock()
+    times_s = [period_s * k for k in (*range(10), *range(20, 30))]
+    delays_s = [0.02, *([0.08, 0.41, 0.7, 0.03] * 5)]
+    for time_s, delay_s in zip(times_s, delays_s, strict=False):
+        found_ns = clock.host_ns((start_s + time_s) % 86_400.0, round(1e9 * (100.0 + time_s + delay_s)))
+        assert found_ns == pytest.approx(1e9 * (100.02 + time_s), abs=10)
+
+
+@pytest.mark.parametrize("step_s", [18.0, -1.0, -3.0])
+def test_a_receiver_that_finds_its_time_anew_is_followed_at_once(step_s):
+    clock = ReceiverClock()
+    for k in range(5):
+        clock.host_ns(50_000.0 + k, round(1e9 * (100.05 + k)))
+    for k in range(5, 10):
+        found_ns = clock.host_ns(50_000.0 + step_s + k, round(1e9 * (100.10 + k)))
+        assert found_ns == pytest.approx(1e9 * (100.10 + k), abs=10)
+
+
 def opened(source):
     """Wait until it listens: what came before the port was open is thrown away."""
     receive_until(source, lambda _, messages: any(message.endswith(": open") for message in messages))
