@@ -25,7 +25,7 @@ from disco_hw.estimation.odometry import (
     WheelReason,
     WheelTracker,
 )
-from disco_hw.estimation.pose_sources import PoseSources
+from disco_hw.estimation.pose_sources import MAX_POSE_RATE_HZ, PoseSources
 from disco_hw.model.drift import Drift
 from drivers.types import PoseSample, WheelSample
 
@@ -267,9 +267,9 @@ def _age_s(now_ns: int, t_ns: int) -> float:
 
 Event = WheelReading | Measurement
 
-# The buffer is sized for these rates; beyond them it covers less time (wheels) or refuses (poses).
+# The buffer is sized for this rate; beyond it, it covers less time.
 MAX_WHEEL_RATE_HZ = 200.0
-MAX_POSE_RATE_HZ = 100.0
+_LEAST_POSE_INTERVAL_NS = round(1e9 / MAX_POSE_RATE_HZ)
 
 
 class RewindBuffer:
@@ -279,6 +279,8 @@ class RewindBuffer:
     whatever order it comes in, while its stamp is inside the buffer. A pose between two wheel readings sees the wheels
     at the angles interpolated linearly in time; one beyond the newest reading is judged on extrapolated angles, and
     again when the next reading is there.
+    A source may have as many poses as time passes by its stamps, at `MAX_POSE_RATE_HZ`, and those of `history_s` at
+    once: up to that rate none is left out, whatever their order and jitter, and beyond it they are thinned evenly.
     One call runs each event in the buffer once at worst. There are never more than `capacity` events;
     `newest_wheels` is the newest wheel reading.
     """
@@ -286,9 +288,11 @@ class RewindBuffer:
     def __init__(self, pose_filter: PoseFilter, first: WheelReading, history_s: float, sources: int = 1) -> None:
         self._filter = pose_filter
         self._history_ns = round(history_s * 1e9)
-        self._max_poses = math.ceil(sources * history_s * MAX_POSE_RATE_HZ)
-        self.capacity = self._max_poses + math.ceil(history_s * MAX_WHEEL_RATE_HZ) + 1
+        self.capacity = math.ceil(sources * history_s * MAX_POSE_RATE_HZ) + math.ceil(history_s * MAX_WHEEL_RATE_HZ) + 1
         self._poses = 0
+        # By source: its newest stamp, and the time (ns) that it may still fill with poses.
+        self._credits: dict[int, tuple[int, int]] = {}
+        self._largest_credit_ns = math.ceil(history_s * MAX_POSE_RATE_HZ) * _LEAST_POSE_INTERVAL_NS
         self._events: list[Event] = [first]
         # States after the first len(_states) events; never empty. The rest are outdated and run on demand.
         self._states: list[FilterState] = [pose_filter.begin(first)]
@@ -328,8 +332,12 @@ class RewindBuffer:
             if before.source < measurement.source:
                 break
             index -= 1
-        if self._poses >= self._max_poses:
+        newest_ns, credit_ns = self._credits.get(measurement.source, (measurement.t_ns, self._largest_credit_ns))
+        credit_ns = min(credit_ns + max(0, measurement.t_ns - newest_ns), self._largest_credit_ns)
+        # One event is left to the newest wheel reading, however many poses come after it.
+        if credit_ns < _LEAST_POSE_INTERVAL_NS or self._poses >= self.capacity - 1:
             return PoseReason.OVERFLOW
+        self._credits[measurement.source] = max(newest_ns, measurement.t_ns), credit_ns - _LEAST_POSE_INTERVAL_NS
         self._events.insert(index, measurement)
         self._poses += 1
         self._outdate(index)

@@ -19,6 +19,8 @@ from typing import Any
 from disco_hw.estimation.correction import PoseReason, PoseUpdate, Triple
 from drivers.types import PoseSample
 
+MAX_POSE_RATE_HZ = 100.0
+"""Of one source; what comes above it is left out, evenly in time."""
 MEAN_WEIGHT = 0.2
 """Of a pose in the running mean of its source's innovations."""
 LEAST_POSES = 10
@@ -57,6 +59,7 @@ class TrackedSource:
     accepted: int = 0
     outliers: int = 0
     refused: int = 0
+    is_thinned: bool = False
     in_a_row: int = 0
     """Accepted poses since the last that was not; of gated ones the negative."""
     left_by_jump: bool = False
@@ -130,6 +133,11 @@ class PoseSources:
             for one in self.all:
                 one.reset_course()
         source.add_evaluation(update.reason, update.innovation, update.innovation_variance)
+        if update.reason is PoseReason.OVERFLOW and not source.is_thinned:
+            source.is_thinned = True
+            self._messages.append(
+                f"{source.label}: more than {MAX_POSE_RATE_HZ:.0f} poses a second; the rest is left out"
+            )
         if update.accepted:
             source.good_ns = max(sample.t_ns, source.good_ns or sample.t_ns)
 

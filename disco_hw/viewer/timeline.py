@@ -165,7 +165,8 @@ class Timeline:
             PoseSample: (self.pose, attrgetter(*POSE)),
             records.Innovation: (
                 self.innovation,
-                lambda it: (*it.innovation, *it.variance, it.test_ratio, it.accepted),
+                # A pose of which there are more than needed is no rejected one.
+                lambda it: (*it.innovation, *it.variance, it.test_ratio, it.accepted or it.reason == "overflow"),
             ),
             records.Plan: (self.planner, planner_of),
             records.PlanFigures: (self.planner, planner_of),

@@ -138,6 +138,8 @@ _PAIR_NS = 60_000_000
 _HEADING_HOLDS_NS = 2_000_000_000
 # Chosen: longer finds a smaller delay, shorter follows a drifting clock sooner.
 _CLOCK_WINDOW_S = 30.0
+# Chosen: above any ground.
+_HIGHEST_M = 10_000.0
 # WGS 84.
 _SEMI_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 # Above NMEA 0183's 82 characters, which receivers exceed in fields of their own.
@@ -196,18 +198,20 @@ class ReceiverClock:
 
     def __init__(self) -> None:
         self._offsets: deque[tuple[float, float]] = deque()
-        self._days, self._last_s = 0.0, 0.0
+        self._days, self._last_s, self._last_arrival_s = 0.0, 0.0, 0.0
 
     def host_ns(self, time_of_day_s: float, arrival_ns: int) -> int:
         """Return when a fix of this time was true, at the latest."""
-        if time_of_day_s < self._last_s - 0.5 * DAY_S:
+        step_s, arrival_s = time_of_day_s - self._last_s, arrival_ns * 1e-9
+        if step_s < -0.5 * DAY_S:
             self._days += DAY_S
-        elif abs(time_of_day_s - self._last_s) > 0.5:
-            # The receiver has found its time anew, or was away: nothing is known of its clock.
+        elif step_s <= 0.0 and arrival_s - self._last_arrival_s - step_s > 0.5:
+            # The receiver has set its time back: the offsets before are too small. A line that is late goes on in time,
+            # and a time that is set forward has the smallest offset at once.
             self._offsets.clear()
-        self._last_s = time_of_day_s
+        self._last_s, self._last_arrival_s = time_of_day_s, arrival_s
         receiver_s = self._days + time_of_day_s
-        self._offsets.append((receiver_s, arrival_ns * 1e-9 - receiver_s))
+        self._offsets.append((receiver_s, arrival_s - receiver_s))
         while receiver_s - self._offsets[0][0] > _CLOCK_WINDOW_S:
             self._offsets.popleft()
         return min(arrival_ns, round(1e9 * (receiver_s + min(offset for _, offset in self._offsets))))
@@ -244,23 +248,11 @@ class Fixes:
 
         ready = self.flush(arrival_ns)
         try:
-            message = NMEAReader.parse(line)
-        except (NMEAParseError, NMEAMessageError, NMEATypeError, ValueError, IndexError, KeyError):
+            return ready + self._handle(NMEAReader.parse(line), arrival_ns)
+        except (NMEAParseError, NMEAMessageError, NMEATypeError, ValueError, IndexError, KeyError, AttributeError):
+            # A field that the sentence lacks is no attribute of its message: AttributeError.
             self.malformed += 1
             return ready
-        kind = "" if message is None else message.msgID
-        if kind == "GST":
-            self._handle_deviation(message)
-        elif kind == "HDT":
-            ready += self._handle_heading(message.headingT, arrival_ns)
-        elif kind == "THS":
-            mode = str(message.mi)
-            ready += self._mode_messages(mode)
-            if mode == MEASURED_MODE:
-                ready += self._handle_heading(message.headt, arrival_ns)
-        elif kind == "GGA":
-            ready += self._handle_position(message, arrival_ns)
-        return ready
 
     def flush(self, now_ns: int) -> list[dict[str, Any]]:
         """Give the position that has waited for a heading long enough."""
@@ -269,9 +261,23 @@ class Fixes:
         waiting, self._waiting = self._waiting, None
         return [waiting]
 
+    def _handle(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
+        kind = "" if message is None else message.msgID
+        if kind == "GST":
+            self._handle_deviation(message)
+        elif kind == "HDT":
+            return self._handle_heading(message.headingT, arrival_ns)
+        elif kind == "THS":
+            mode, heading_deg = str(message.mi), message.headt
+            notes = self._mode_messages(mode)
+            return notes + self._handle_heading(heading_deg, arrival_ns) if mode == MEASURED_MODE else notes
+        elif kind == "GGA":
+            return self._handle_position(message, arrival_ns)
+        return []
+
     def _handle_deviation(self, message: Any) -> None:
         time_s, deviations = _time_of_day_s(message.time), (message.stdLat, message.stdLong)
-        if time_s is not None and all(isinstance(one, float) and one > 0.0 for one in deviations):
+        if time_s is not None and all(isinstance(one, float) and 0.0 < one < math.inf for one in deviations):
             self._gst = (time_s, max(deviations))
 
     def _handle_heading(self, heading_deg: Any, arrival_ns: int) -> list[dict[str, Any]]:
@@ -282,25 +288,29 @@ class Fixes:
         return [] if waiting is None else [self._with_heading(waiting, self._heading)]
 
     def _handle_position(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
-        quality, time_s = message.quality, _time_of_day_s(message.time)
+        quality, time_s, hdop = message.quality, _time_of_day_s(message.time), message.HDOP
+        latitude_deg, longitude_deg, altitude_m, separation_m = message.lat, message.lon, message.alt, message.sep
+        if quality != self._quality and self._gst is not None and self._gst[0] != time_s:
+            # It was of the quality before.
+            self._gst = None
         notes = self._quality_messages(quality)
         if quality not in QUALITY_STD_M:
             return notes
-        if time_s is None or not (isinstance(message.lat, float) and isinstance(message.lon, float)):
+        if time_s is None or not (_is_within(latitude_deg, 90.0) and _is_within(longitude_deg, 180.0)):
             return notes + self._without_repeats("GGA sentences lack time, latitude or longitude and give no position")
-        height_m, height_notes = self._height_of(message)
+        height_m, height_notes = self._height_of(altitude_m, separation_m)
         notes += height_notes + self._heading_hint(arrival_ns)
         if self._plane is None:
-            latitude, longitude = self.datum or (message.lat, message.lon)
+            latitude, longitude = self.datum or (latitude_deg, longitude_deg)
             self._plane = TangentPlane(latitude, longitude, height_m)
             notes.append({"said": f"datum: latitude {latitude:.8f}, longitude {longitude:.8f}"})
-        east_m, north_m = self._plane.east_north(message.lat, message.lon, height_m)
+        east_m, north_m = self._plane.east_north(latitude_deg, longitude_deg, height_m)
         notes += self._range_messages(math.hypot(east_m, north_m))
         position = {
             "t_ns": self._clock.host_ns(time_s, arrival_ns),
             "x_m": east_m,
             "y_m": north_m,
-            "position_std_m": self._deviation_m(quality, time_s, message.HDOP),
+            "position_std_m": self._deviation_m(quality, time_s, hdop),
         }
         if self._heading is None or arrival_ns - self._heading.arrival_ns > _HEADING_HOLDS_NS:
             return [*notes, position]
@@ -315,13 +325,13 @@ class Fixes:
         usual = QUALITY_STD_M[quality]
         return usual * max(hdop, 1.0) if isinstance(hdop, float) else usual
 
-    def _height_of(self, message: Any) -> tuple[float, list[dict[str, Any]]]:
+    def _height_of(self, altitude_m: Any, separation_m: Any) -> tuple[float, list[dict[str, Any]]]:
         """Return the height over the ellipsoid: the fix's, else the last known one, else 0.
 
         The plane's scale hangs on it.
         """
-        if isinstance(message.alt, float):
-            self._height_m = message.alt + (message.sep if isinstance(message.sep, float) else 0.0)
+        if _is_within(altitude_m, _HIGHEST_M):
+            self._height_m = altitude_m + (separation_m if _is_within(separation_m, _HIGHEST_M) else 0.0)
             return self._height_m, []
         source_text = "0 m" if self._height_m is None else f"the last height, {self._height_m:.1f} m"
         return self._height_m or 0.0, self._without_repeats(
@@ -378,6 +388,11 @@ class Fixes:
         names = {0: "no fix: the antenna needs a clear view of the sky", 4: "RTK fix", 5: "RTK with float ambiguities"}
         unused = "" if quality in QUALITY_STD_M else "; its positions are not used"
         return [{"said": f"fix quality {quality}: {names.get(quality, 'not RTK')}{unused}"}]
+
+
+def _is_within(number: Any, limit: float) -> bool:
+    """Whether a sentence's field is a number of this size at most; an empty field is a string."""
+    return isinstance(number, float) and abs(number) <= limit
 
 
 def _time_of_day_s(message: Any) -> float | None:

@@ -244,3 +244,17 @@ def test_a_time_without_poses_is_counted_once_and_a_steady_rate_never():
     for ms in (*range(0, 2000, 40), *range(2200, 4000, 40), *range(4000, 6000, 100)):
         fusion.add_pose(pose(ms), ms * MS)
     assert fusion.stats.pose_gaps == 1
+
+
+def test_poses_of_240_hz_are_used_all_the_time_and_their_thinning_is_said_once():
+    fusion, ages_s = fusion_with(), []
+    for tick in range(150):
+        now_ms = 20 * tick
+        for t_ms in (now_ms - 10, now_ms):
+            fusion.add_wheels(wheels(t_ms))
+        for k in range(240 * (now_ms - 20) // 1000 + 1, 240 * now_ms // 1000 + 1):
+            fusion.add_pose(msgspec.structs.replace(pose(0), t_ns=k * 1_000_000_000 // 240), now_ms * MS)
+        ages_s.append(fusion.estimate(now_ms * MS).pose_age_s)
+    assert max(ages_s[2:]) < 0.015
+    assert fusion.stats.poses_accepted + fusion.stats.poses_overflow == pytest.approx(720, abs=5)
+    assert fusion.sources.new_messages() == ["poses: more than 100 poses a second; the rest is left out"]

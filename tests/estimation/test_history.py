@@ -3,6 +3,7 @@
 import itertools
 import random
 
+import msgspec
 import pytest
 
 from disco_hw.config import Estimation
@@ -160,13 +161,57 @@ def test_length_is_bounded_whatever_the_rates():
     assert isinstance(buffer.head().t_ns, int)
 
 
-def test_a_flood_of_poses_is_refused_and_passes_with_time():
+@pytest.mark.parametrize("rate_hz", [120, 240, 360, 1000])
+def test_of_more_than_100_poses_a_second_the_rest_is_left_out_evenly(rate_hz):
     buffer = buffer_with([0])
-    outcomes = [buffer.add_pose(measured(1.0 + k * 0.001)) for k in range(150)]
-    assert [isinstance(outcome, Evaluation) for outcome in outcomes] == [True] * 100 + [False] * 50
-    assert outcomes[-1] is PoseReason.OVERFLOW
+    kept_ms = []
+    for k in range(4 * rate_hz):
+        t_ms = 1000.0 * k / rate_hz
+        if t_ms >= buffer.newest_wheels.t_ns / MS + 10.0:
+            buffer.add_wheels(reading(buffer.newest_wheels.t_ns / MS + 10.0))
+        outcome = buffer.add_pose(measured(t_ms))
+        assert outcome is PoseReason.OVERFLOW or isinstance(outcome, Evaluation)
+        kept_ms += [t_ms] if isinstance(outcome, Evaluation) else []
+        assert len(buffer) <= buffer.capacity
+    gaps_ms = [after - before for before, after in itertools.pairwise(kept_ms)]
+    assert max(gaps_ms) < 10.0 + 1000.0 / rate_hz
+    # A second's worth may come at once; from then on they are as many as time has passed.
+    assert len(kept_ms) == pytest.approx(min(4 * rate_hz, 500), abs=2)
+
+
+def test_up_to_100_poses_a_second_none_is_left_out_in_whatever_order_and_by_whatever_jitter():
+    rng = random.Random(1)
+    poses = [measured(max(0.0, 10.0 * k + rng.uniform(-9.0, 9.0))) for k in range(90)]
+    in_order = run(
+        sorted([*poses, *range(1, 1000, 10)], key=lambda e: e.t_ns / MS if isinstance(e, Measurement) else e)
+    )
+    rng.shuffle(poses)
+    assert run([*range(1, 1000, 10), *poses]) == in_order
+
+
+def of_source(source, t_ms):
+    return msgspec.structs.replace(near(t_ms), source=source)
+
+
+def test_a_fast_source_takes_nothing_from_a_slow_one_that_is_late():
+    buffer = RewindBuffer(PoseFilter(SETTINGS, PARAMETERS), reading(0), 1.0, 2)
+    for t_ms in range(10, 2000, 10):
+        buffer.add_wheels(reading(t_ms))
+        fast = [isinstance(buffer.add_pose(of_source(0, t_ms - k)), Evaluation) for k in range(9, -1, -1)]
+        assert sum(fast) == 1 or t_ms < 200
+        if t_ms % 200 == 0 and t_ms > 900:
+            assert isinstance(buffer.add_pose(of_source(1, t_ms - 899.5)), Evaluation)
+
+
+def test_a_flood_of_four_sources_while_no_wheels_come_breaks_nothing():
+    buffer = RewindBuffer(PoseFilter(SETTINGS, PARAMETERS), reading(0), 1.0, 4)
+    for t_ms in range(1, 1000):
+        for source in range(4):
+            buffer.add_pose(of_source(source, t_ms))
+    assert len(buffer) == buffer.capacity
     buffer.add_wheels(reading(1500))
-    assert isinstance(buffer.add_pose(measured(1499.0)), Evaluation)
+    assert isinstance(buffer.add_pose(of_source(0, 1499.5)), Evaluation)
+    assert buffer.head().t_ns == 1500 * MS
 
 
 def test_a_gap_longer_than_the_buffer_loses_no_distance():

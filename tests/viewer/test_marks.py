@@ -1,3 +1,5 @@
+import math
+
 from disco_hw.log import records
 from disco_hw.viewer.timeline import ADAPTED, EVENT, FAULT, GATED, OVERRUN, REJECTED_FRAMES, Timeline, marks_of
 from tools.viewer_run import FAULT_TICK, GATED_TICK, OVERRUN_TICK, PERIOD_NS, REJECTED_TICK, START_NS
@@ -29,6 +31,13 @@ def test_what_goes_on_and_on_is_marked_once_in_half_a_second():
         t_ns = tick * PERIOD_NS
         line.add(t_ns, records.Innovation(t_ns, (9.0,) * 3, (1.0,) * 3, 50.0, False))
     assert [mark.t_ns for mark in marks_of(line)] == [0, 520_000_000, 1_040_000_000, 1_560_000_000]
+
+
+def test_a_pose_that_is_left_out_because_there_are_many_is_not_marked():
+    line = Timeline()
+    for t_ns, reason in ((0, "overflow"), (10**9, "too_old")):
+        line.add(t_ns, records.Innovation(t_ns, (math.nan,) * 3, (math.nan,) * 3, math.nan, False, reason))
+    assert [(mark.t_ns, mark.text) for mark in marks_of(line)] == [(10**9, "a measured pose not used")]
 
 
 def test_what_adaptation_did_is_marked():

@@ -92,6 +92,39 @@ def test_what_is_no_fix_gives_none_and_breaks_nothing(broken):
     assert poses(Fixes().add_line(broken, NOW_NS)) == []
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "GNTHS,77.520",
+        "GNHDT",
+        "GNGST,092725.00.1.0y0.02,0.01,45.0,0.014,0.012,0.03",
+        "GNGGA,092725.00",
+        "GNGGA,092725.00,4717.11399,N,00833.91590,E,4",
+        "GNGGA,092725.00,4717.11399,N,00833.91590,E,4,08,1.01,499.6,M",
+    ],
+)
+def test_a_sentence_that_lacks_fields_is_malformed_and_changes_nothing(text):
+    fixes, whole = Fixes(), Fixes()
+    assert fixes.add_line(sentence(text), NOW_NS) == []
+    assert fixes.malformed == 1
+    assert fixes.add_line(GGA_ALONE, NOW_NS) == whole.add_line(GGA_ALONE, NOW_NS)
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["4717.e113979,N,00833.91590,E", "4717.e300,N,00833.91590,E", "9001.0,S,00833.91590,E", "4717.11399,N,18001.0,W",
+     "nan17.1,N,00833.91590,E"],
+)  # fmt: skip
+def test_what_is_no_place_on_earth_is_no_position(place):
+    found = parsed(fix(4, place=place), fix(4))
+    assert [(pose["x_m"], pose["y_m"]) for pose in poses(found)] == [pytest.approx((0.0, 0.0), abs=1e-6)]
+
+
+@pytest.mark.parametrize("altitude", ["nan", "inf", "1e300", "-1e200"])
+def test_an_altitude_that_is_none_is_as_if_there_were_none(altitude):
+    assert parsed(fix(4, altitude), fix(4)) == parsed(fix(4, ""), fix(4))
+
+
 def test_a_datum_of_another_town_is_said():
     fixes = Fixes(datum=(47.0, 8.5))
     messages = [each["said"] for each in fixes.add_line(GGA_ALONE, NOW_NS) if "said" in each]
@@ -113,6 +146,21 @@ def test_the_deviation_follows_the_quality():
     for k, (quality, std_m) in enumerate(QUALITY_STD_M.items()):
         (pose,) = poses(fixes.add_line(gga(10.0 * k, 47.0, 8.0, quality=quality), NOW_NS + 10**10 * k))
         assert pose["position_std_m"] == std_m
+
+
+def test_the_deviation_of_one_quality_is_not_that_of_another():
+    """GST at 1 Hz, before or after the GGA of its time."""
+
+    def deviation(*lines):
+        return poses(parsed(*lines))[-1]["position_std_m"]
+
+    fine, rough = sentence("GNGST,092725.00,,,,,0.014,0.012,0.03"), sentence("GNGST,092725.20,,,,,2.0,4.0,5.0")
+    single, single_later = fix(1, time="092725.20"), fix(1, time="092725.40")
+    assert deviation(fix(4), fine, fix(4, time="092725.20")) == 0.014
+    assert deviation(fix(4), fine, single) == pytest.approx(3.0 * 1.01)
+    assert deviation(fix(4), fine, single, single_later) == pytest.approx(3.0 * 1.01)
+    assert deviation(fix(4), fine, fix(0, time="092725.20"), fix(4, time="092725.40")) == pytest.approx(0.02 * 1.01)
+    assert deviation(fix(4), fine, rough, single) == deviation(fix(4), fine, single, rough, single_later) == 4.0
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
@@ -145,6 +193,27 @@ def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     night.host_ns(86_399.8, 10**9)
     assert night.host_ns(0.0, 10**9 + 350_000_000) == pytest.approx(10**9 + 200_000_000, abs=10)
     assert night.host_ns(18.0, 2 * 10**9) == 2 * 10**9
+
+
+@pytest.mark.parametrize("period_s", [0.1, 1.0])
+@pytest.mark.parametrize("start_s", [43_200.0, 86_395.0])
+def test_the_receivers_time_is_used_at_every_rate_and_over_midnight_and_a_silence(period_s, start_s):
+    clock = ReceiverClock()
+    times_s = [period_s * k for k in (*range(10), *range(20, 30))]
+    delays_s = [0.02, *([0.08, 0.41, 0.7, 0.03] * 5)]
+    for time_s, delay_s in zip(times_s, delays_s, strict=False):
+        found_ns = clock.host_ns((start_s + time_s) % 86_400.0, round(1e9 * (100.0 + time_s + delay_s)))
+        assert found_ns == pytest.approx(1e9 * (100.02 + time_s), abs=10)
+
+
+@pytest.mark.parametrize("step_s", [18.0, -1.0, -3.0])
+def test_a_receiver_that_finds_its_time_anew_is_followed_at_once(step_s):
+    clock = ReceiverClock()
+    for k in range(5):
+        clock.host_ns(50_000.0 + k, round(1e9 * (100.05 + k)))
+    for k in range(5, 10):
+        found_ns = clock.host_ns(50_000.0 + step_s + k, round(1e9 * (100.10 + k)))
+        assert found_ns == pytest.approx(1e9 * (100.10 + k), abs=10)
 
 
 def opened(source):
