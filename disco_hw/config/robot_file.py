@@ -281,11 +281,12 @@ def _check_task(path: Path, config: RobotConfig) -> None:
 def task_fault(config: RobotConfig, task: RobotTask) -> FieldFault | None:
     """Return why this robot cannot be given a task, from robot.toml or while it runs; None if it can."""
     slowest_m_s = config.slowest_wheel_rad_s * config.robot.wheel_radius_m
-    if task.speed_m_s < slowest_m_s:
+    # NaN for way-points with times, which may ask the robot to rest: they are never too slow.
+    if task.reference_speed_m_s < slowest_m_s:
         least_m_s = math.ceil(100.0 * slowest_m_s) / 100.0
         return FieldFault(
             "speed_m_s",
-            f"{task.speed_m_s} m/s is slower than the motor controller can hold",
+            f"{task.reference_speed_m_s} m/s is slower than the motor controller can hold",
             f"write at least {least_m_s:.2f}, or set the motor controller for lower speeds",
         )
     if task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
