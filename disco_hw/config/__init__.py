@@ -21,7 +21,13 @@ from disco_hw.config.robot import (
     RobotConfig,
     Ros2,
 )
-from disco_hw.config.robot_file import link_of, load_daemon_address, load_robot_config, refuse_outside_task
+from disco_hw.config.robot_file import (
+    link_of,
+    load_daemon_address,
+    load_robot_config,
+    refuse_outside_task,
+    task_fault,
+)
 from disco_hw.errors import InputError
 from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 
@@ -47,6 +53,7 @@ __all__ = [
     "load_robot_config",
     "names_address",
     "refuse_outside_task",
+    "task_fault",
 ]
 
 SHIPPED_ROBOT = Path(__file__).parents[1] / "robots" / "wombot.toml"

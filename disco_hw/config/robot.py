@@ -284,3 +284,8 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     def footprint_along_line(self) -> Footprint:
         """The footprint as seen along the task's line: of a robot that drives backwards what is behind lies ahead."""
         return self.robot.footprint.turned if self.turned_rad else self.robot.footprint
+
+    @property
+    def slowest_wheel_rad_s(self) -> float:
+        """Slowest true speed of a wheel that the motor controller holds, rad/s."""
+        return find_driver(self.link.driver).slowest_rad_s(self.link.settings()) * self.wheels.turn_ratio

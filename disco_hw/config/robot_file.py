@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import msgspec
 
 from disco_hw.config.robot import Link, PoseInput, Prior, Robot, RobotConfig
-from disco_hw.errors import InputError
+from disco_hw.errors import FieldFault, InputError
 from disco_hw.fence import fence_fault
 from disco_hw.files import ROBOT_TOML, control_character_in, describe, read_toml
 from drivers.motor import DriverFieldError, UnknownDriverError, fields_of, find_driver
@@ -266,14 +266,6 @@ def _check_allowed_senders(path: Path, pose: PoseInput) -> None:
 def _check_task(path: Path, config: RobotConfig) -> None:
     """Refuse what no single field of [task] shows."""
     _check_values(path, "task", config.task)
-    slowest = find_driver(config.link.driver).slowest_rad_s(config.link.settings()) * config.robot.wheel_radius_m
-    if config.task.speed_m_s < slowest:
-        _refuse(
-            path,
-            "task.speed_m_s",
-            f"{config.task.speed_m_s} m/s is slower than the motor controller can hold",
-            f"write at least {slowest:.2f}, or set the motor controller for lower speeds",
-        )
     if config.control.fallback != "ramp" and math.isnan(config.task.reference_speed_m_s):
         _refuse(path, "control.fallback", "way-points with times have no single speed to follow", 'write "ramp"')
     if config.control.facing == "backwards":
@@ -281,13 +273,26 @@ def _check_task(path: Path, config: RobotConfig) -> None:
             _refuse(path, "control.facing", "the paper's cost knows of no facing", 'write mode = "default"')
         if config.control.fallback != "ramp":
             _refuse(path, "control.facing", "the law of control.fallback drives forwards", 'write fallback = "ramp"')
-    fault = config.task.fault()
+    fault = task_fault(config, config.task)
     if fault is not None:
         _refuse(path, f"task.{fault.field}", fault.fault, fault.hint)
-    if config.task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
-        _refuse(
-            path,
-            "task.speed_m_s",
-            f"{config.task.speed_m_s} m/s is above what the wheels can do",
+
+
+def task_fault(config: RobotConfig, task: RobotTask) -> FieldFault | None:
+    """Return why this robot cannot be given a task, from robot.toml or while it runs; None if it can."""
+    slowest_m_s = config.slowest_wheel_rad_s * config.robot.wheel_radius_m
+    # NaN for way-points with times, which may ask the robot to rest: they are never too slow.
+    if task.reference_speed_m_s < slowest_m_s:
+        least_m_s = math.ceil(100.0 * slowest_m_s) / 100.0
+        return FieldFault(
+            "speed_m_s",
+            f"{task.reference_speed_m_s} m/s is slower than the motor controller can hold",
+            f"write at least {least_m_s:.2f}, or set the motor controller for lower speeds",
+        )
+    if task.speed_m_s > config.robot.max_wheel_speed_rad_s * config.robot.wheel_radius_m:
+        return FieldFault(
+            "speed_m_s",
+            f"{task.speed_m_s} m/s is above what the wheels can do",
             "lower it, or raise robot.max_wheel_speed_rad_s within the firmware's limit",
         )
+    return task.fault()

@@ -40,10 +40,14 @@ class Detour:
 
 
 class Detours:
-    """The detours around the obstacles that stand on a line."""
+    """The detours around the obstacles that stand on a line.
 
-    def __init__(self, footprint: Footprint) -> None:
+    `turned_rad`: from the line's direction to the heading in which the robot follows it, pi backwards.
+    """
+
+    def __init__(self, footprint: Footprint, turned_rad: float = 0.0) -> None:
         self._footprint = footprint
+        self._turned_rad = turned_rad
         self._line = np.empty((0, 2))
         self._directions = np.empty((0, 2))
         self._found: list[Detour] = []
@@ -124,5 +128,6 @@ class Detours:
 
     def _is_free(self, bounds: Boundaries, here: Array, along: Array, left_m: float) -> bool:
         """Whether the footprint is clear of everything at the detour's middle."""
-        pose = (here[0] - along[1] * left_m, here[1] + along[0] * left_m, math.atan2(along[1], along[0]))
+        yaw_rad = math.atan2(along[1], along[0]) + self._turned_rad
+        pose = (here[0] - along[1] * left_m, here[1] + along[0] * left_m, yaw_rad)
         return bool(bounds.clearance_m(np.array([pose]))[0] >= 0.0)

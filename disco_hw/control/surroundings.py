@@ -41,6 +41,7 @@ class Surroundings:
     """Fence and obstacles that a planner keeps away from, in the buffers that its kernel reads.
 
     `max_breach_probability`: of a plan over its horizon; with the pose's deviation it makes the distance to keep.
+    `turned_rad`: from the line's direction to the heading in which the robot follows it, pi backwards.
     """
 
     def __init__(
@@ -51,10 +52,11 @@ class Surroundings:
         step_s: float,
         horizon: int,
         speed_m_s: float,
+        turned_rad: float = 0.0,
     ) -> None:
         self.speed_m_s = speed_m_s
         """The task's speed."""
-        self._detours = Detours(footprint)
+        self._detours = Detours(footprint, turned_rad)
         self._footprint = footprint
         self._margin_m = margin_m
         self._deviations = NormalDist().inv_cdf(1.0 - max_breach_probability)

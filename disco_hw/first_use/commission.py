@@ -94,12 +94,6 @@ class CommissionResult:
         return "\n".join([*lines, "commissioned" if self.ok else "not commissioned: correct what is named above"])
 
 
-def slowest_rad_s(setup: Setup) -> float:
-    """Return the slowest true speed of a wheel that the controller holds."""
-    link = setup.config.link
-    return find_driver(link.driver).slowest_rad_s(link.settings()) * setup.config.wheels.turn_ratio
-
-
 def as_sent(setup: Setup) -> Setup:
     """Return the robot with its poses as the first source sends them, and without those of others."""
     plain = msgspec.structs.replace(
@@ -205,7 +199,7 @@ def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     log = new_log(setup.config, f"commission-{stage.name}-")
     log = (options.log_directory or log.parent) / log.name
     keyboard = Keyboard(STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
-    procedure = Procedure(stage.steps(setup.config.robot, slowest_rad_s(setup)))
+    procedure = Procedure(stage.steps(setup.config.robot, setup.config.slowest_wheel_rad_s))
     pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.is_ignored)
     try:
         _print("keys", "hold the space bar to drive, let go to stop; Ctrl-D gives up")

@@ -86,6 +86,7 @@ def create_surroundings(config: RobotConfig, settings: control.DiscoSettings) ->
         settings.step_s,
         settings.sampler.horizon,
         config.task.speed_m_s,
+        config.turned_rad,
     )
     around.set_line(config.task.course().outline_m())
     around.look_around(Boundaries(config.robot.footprint, config.fence), 0.0)

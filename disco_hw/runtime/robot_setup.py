@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config, refuse_outside_task
+from disco_hw.config import (
+    PoseInput,
+    Robot,
+    RobotConfig,
+    link_fields,
+    load_robot_config,
+    refuse_outside_task,
+    task_fault,
+)
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import fence_outlines, footprint_outline
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
@@ -172,19 +180,19 @@ class TaskRefused(Exception):  # noqa: N818
     """The change is not made; the message says why and what to do."""
 
 
-def changed_task(task: RobotTask, requested: Mapping[str, Any], robot: Robot, state: State) -> RobotTask:
+def changed_task(task: RobotTask, requested: Mapping[str, Any], config: RobotConfig, state: State) -> RobotTask:
     """Return the task with the fields in `requested`, all of them editable, m and m/s.
 
-    Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, and for a
-    speed that the wheels cannot reach on the changed task.
+    Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, for a
+    speed that the wheels cannot reach on the changed task, and for what robot.toml would be refused for.
     """
     if state in IN_USE:
         raise TaskRefused(
             f"the task can be changed only while the robot is disarmed (it is {state.name}); disarm first"
         )
-    editable = task.editable(robot)
+    editable = task.editable(config.robot)
     if not editable:
-        raise TaskRefused(task.editing_note(robot))
+        raise TaskRefused(task.editing_note(config.robot))
     unknown = sorted(set(requested) - set(editable))
     if unknown or not requested:
         raise TaskRefused(f"give one or more of {', '.join(editable)}" + (f", not {unknown[0]}" if unknown else ""))
@@ -194,9 +202,12 @@ def changed_task(task: RobotTask, requested: Mapping[str, Any], robot: Robot, st
         # What the wheels can do depends on the other fields too, and is judged below.
         values[name] = _number(name, value, low, _FASTEST_M_S if name == "speed_m_s" else high)
     changed = with_values(task, values)
-    refusal = changed.too_fast(robot)
+    refusal = changed.too_fast(config.robot)
     if refusal is not None:
         raise TaskRefused(refusal)
+    fault = task_fault(config, changed)
+    if fault is not None:
+        raise TaskRefused(f"{fault.field}: {fault.fault}; {fault.hint}")
     return changed
 
 

@@ -51,10 +51,10 @@ def distance(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -
     return Curves(t_s, {"distance (m)": away})
 
 
-def speed(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int) -> Curves:
-    """Estimated speed against the task's (m/s); NaN for a task without one speed."""
+def speed(task: RobotTask, timeline: Timeline, first_ns: int, last_ns: int, drives_backwards: bool = False) -> Curves:
+    """Estimated speed against the task's (m/s), both negative backwards; NaN for a task without one speed."""
     t_s, rows = _window(timeline, timeline.estimate, first_ns, last_ns)
-    reference = np.full(len(t_s), task.reference_speed_m_s)
+    reference = np.full(len(t_s), -task.reference_speed_m_s if drives_backwards else task.reference_speed_m_s)
     return Curves(t_s, {"speed (m/s)": rows[:, ESTIMATE.index("speed_m_s")], "reference": reference})
 
 
@@ -155,7 +155,7 @@ class Plots:
         self._belief: BeliefChange | None = None
         with gui.add_folder("Plots"):
             self._add(gui, f"Distance to the {stage.task.course().noun} (m)", distance, least=_LEAST)
-            self._add(gui, "Speed (m/s)", speed)
+            self._add(gui, "Speed (m/s)", partial(speed, drives_backwards=stage.drives_backwards))
             self._add(gui, "Wheels (rad/s)", _any_task(wheels))
             self._add(gui, "Planner", _any_task(planner), ("temperature",))
         with gui.add_folder("Innovations", expand_by_default=False):

@@ -37,8 +37,6 @@ _DRIVE_TIMEOUT_S = 0.5
 _RESERVED_DESCRIPTORS = 16
 # Above any message of the page.
 _MOST_BYTES = 4096
-# Chosen: further than any task; the daemon judges what is nearer.
-_MOST_M = 1e6
 
 _OPEN = {"do": "drive", "forward": 0, "left": 0, "held": False, "stamp": "0"}
 
@@ -103,7 +101,7 @@ class Desk:
                 elif request["do"] == "drive":
                     await drive.query(request)
                 elif request["do"] == "draft":
-                    self.draft = _numbers(request.get("values"))
+                    self.draft = self._within_limits(request.get("values"))
                     edits = self.draft is not None
                 else:
                     task = asyncio.create_task(self._forward_request(request, send))
@@ -124,13 +122,26 @@ class Desk:
 
     def drag(self, values: Mapping[str, float]) -> None:
         """Take what was pulled in the scene into the draft, to the centimetre and within the daemon's limits."""
-        draft, status = self.draft, self.status
-        if draft is None or status is None or not status.get("ok"):
+        draft, within = self.draft, self._within_limits(values)
+        if draft is None or within is None:
             return
-        limits = status["task"]["limits"]
-        within = {name: min(max(value, limits[name][0]), limits[name][1]) for name, value in values.items()}
         self.draft = draft | {name: round(value, 2) for name, value in within.items()}
         self._drags += 1
+
+    def _within_limits(self, values: object) -> dict[str, float] | None:
+        """Return the numbers of a draft, each within its limits; None without any, or while no limits are known.
+
+        This process sends the e-stop, too: what is drawn must not be larger than what the daemon accepts. The speed is
+        left out: it is not drawn, and its limit is for the size in force.
+        """
+        status = self.status
+        if not isinstance(values, Mapping) or status is None or not status.get("ok"):
+            return None
+        return {
+            name: float(min(max(values[name], least), largest))
+            for name, (least, largest) in status["task"]["limits"].items()
+            if name != "speed_m_s" and isinstance(values.get(name), int | float)
+        }
 
     def close(self) -> None:
         """Stop the desk's threads; safe to call twice."""
@@ -292,17 +303,6 @@ class _DriveLine:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-
-
-def _numbers(values: object) -> dict[str, float] | None:
-    """Return the numbers that a browser sent for the task that it edits; None where it sent no table."""
-    if not isinstance(values, dict):
-        return None
-    return {
-        str(name): float(value)
-        for name, value in values.items()
-        if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < _MOST_M
-    }
 
 
 def _request(message: str | bytes) -> dict[str, Any] | None:

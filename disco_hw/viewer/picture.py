@@ -118,7 +118,7 @@ def _draw(figure: Figure, recording: Recording, t_s: float) -> None:
     task = stage.task_at(snapshot.task)
     cuts: tuple[tuple[str, Callable[[Timeline, int, int], Curves]], ...] = (
         (f"distance to the {task.course().noun} (m)", partial(curves.distance, task)),
-        ("speed (m/s)", partial(curves.speed, task)),
+        ("speed (m/s)", partial(curves.speed, task, drives_backwards=stage.drives_backwards)),
         ("wheels (rad/s)", curves.wheels),
     )
     for row, (title, cut) in enumerate(cuts):

@@ -201,7 +201,7 @@ class ShownRobot:
     """The robot's name, its task, nominal size (m) and model.
 
     `x_icr_m` is the model's, `drive_top_rad_s` the fastest that a wheel is driven by hand; `fence` and `footprint` are
-    robot.toml's.
+    robot.toml's. `drives_backwards`: along the task's line.
     """
 
     name: str
@@ -213,6 +213,7 @@ class ShownRobot:
     model: Model
     fence: Fence = Fence()  # noqa: RUF009 - it is frozen
     footprint: Footprint = Footprint(0.5, 0.4)  # noqa: RUF009 - it is frozen
+    drives_backwards: bool = False
 
     def task_at(self, record: Task | None) -> RobotTask:
         """Return the task that is in force where this record of it is the newest; robot.toml's without one."""
@@ -242,6 +243,7 @@ def _stage(setup: Setup) -> ShownRobot:
         model=setup.model,
         fence=setup.config.fence,
         footprint=robot.footprint,
+        drives_backwards=bool(setup.config.turned_rad),
     )
 
 

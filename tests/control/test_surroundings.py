@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import disco_hw
-from disco_hw.control import NoValidControl, PlannerState, PlanOutcome
+from disco_hw.control import DiscoSettings, NoValidControl, PlannerState, PlanOutcome
 from disco_hw.control.detours import SPARE_M, Detours
 from disco_hw.control.kernel.avoid import (
     COLUMNS,
@@ -25,8 +25,9 @@ from disco_hw.control.kernel.avoid import (
 from disco_hw.control.surroundings import Surroundings
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries, MovingCircle
-from disco_hw.runtime.assembly import create_planner
+from disco_hw.runtime.assembly import create_planner, create_surroundings
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.tasks.path import PathTask
 from tests.control.kernel.test_avoid import touched
 from tests.control.kernel.test_step import allocations
 
@@ -113,6 +114,22 @@ def test_the_other_side_is_taken_where_the_shorter_one_is_closed():
     free, closed = (detours(bounds_of(fence, [MovingCircle(0.5, 0.05, 0.1)]))[0, 5] for fence in (Fence(), wall))
     assert free == pytest.approx(0.05 - NEEDED_M)
     assert closed == pytest.approx(0.05 + NEEDED_M)
+
+
+@pytest.mark.parametrize("facing", ["forwards", "backwards"])
+@pytest.mark.parametrize("post_x_m", [-0.3, 0.3])
+def test_a_side_is_closed_where_the_robot_lies_on_its_line_as_it_drives_it(facing, post_x_m):
+    setup = load_setup(ROBOT_FILE)
+    robot = msgspec.structs.replace(setup.config.robot, footprint_m=Footprint(0.4, 0.3, 0.25))
+    fence = Fence(keep_out=(Circle((0.0, 0.02), 0.1), Circle((post_x_m, -0.4), 0.1)))
+    control = msgspec.structs.replace(setup.config.control, facing=facing)
+    task = PathTask(path="line.csv", points=((-2.0, 0.0), (2.0, 0.0)))
+    config = msgspec.structs.replace(setup.config, robot=robot, fence=fence, control=control, task=task)
+    found = create_surroundings(config, DiscoSettings())
+    left_m = found.place(0.0, 0.0, (0.0, 0.0), 0.2).detours[5]
+    # The whole footprint is ahead of the tracked point; the right side is the shorter one, and the post stands there.
+    is_hit = (post_x_m > 0.0) == (facing == "forwards")
+    assert left_m == pytest.approx(0.38 if is_hit else -0.34)
 
 
 def test_a_detour_keeps_its_side_while_the_obstacle_wavers():

@@ -12,7 +12,7 @@ from disco_hw.drive import ManualInput
 from disco_hw.errors import WorkError
 from disco_hw.experiments import with_device
 from disco_hw.experiments.simulated_time import SimulatedRun
-from disco_hw.first_use.commission import as_sent, slowest_rad_s
+from disco_hw.first_use.commission import as_sent
 from disco_hw.first_use.procedure import CommissionPilot, DriveWheels, Procedure, Prompt, speed_of
 from disco_hw.runtime import State
 from disco_hw.runtime.pipeline import NoPlanner
@@ -228,10 +228,11 @@ def stage(path, steps, wrong, plant=None, effects=None, raw_poses=False, limit_s
         setup = as_sent(setup)
     robot = MiswiredRobot(setup, plant or PlantParameters(), wrong, effects, **options)
     operator = SimulatedOperator(robot.plant)
-    pilot = CommissionPilot(Procedure(steps(setup.config.robot, slowest_rad_s(setup))), operator, operator.keys)
+    slowest_rad_s = setup.config.slowest_wheel_rad_s
+    pilot = CommissionPilot(Procedure(steps(setup.config.robot, slowest_rad_s)), operator, operator.keys)
     operator.pilot = pilot
     run = SimulatedRun(setup, robot, NoPlanner(), pilot)
-    run.where, run.slow_rad_s = [], speed_of(setup.config.robot, slowest_rad_s(setup))
+    run.where, run.slow_rad_s = [], speed_of(setup.config.robot, slowest_rad_s)
     try:
         for tick in run.ticks(limit_s):
             run.where.append((tick.command, robot.plant.physical))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import re
 
 import msgspec
 import pytest
 
-from disco_hw.config import Robot
+from disco_hw.config import Robot, RobotConfig, load_robot_config
+from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.runtime import State
 from disco_hw.runtime.replay import replay
@@ -25,16 +27,18 @@ from disco_hw.tasks import CENTER_M, SLOWEST_M_S
 from disco_hw.tasks.circle import RADIUS_M, CircleTask
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
+from tests.drivers.motor.test_motor_drivers import EXAMPLES, robot_toml
 from tests.runtime.simulated import recorded, replayed, simulated_stack
 from tests.runtime.test_replay import write_log
 
 ROBOT = Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=8.0)
+CONFIG = RobotConfig(robot=ROBOT)
 LINE = PathTask(path="line.csv", speed_m_s=0.2, points=((0.0, 0.0), (2.0, 0.0)))
 TIMED = TimedPathTask(path="line.csv", points=LINE.points, times_s=(0.0, 10.0))
 
 
 def test_the_fields_that_are_given_change_and_the_others_stay():
-    changed = changed_task(CircleTask(center_x_m=1.0), {"radius_m": 0.5, "speed_m_s": 0.1}, ROBOT, State.READY)
+    changed = changed_task(CircleTask(center_x_m=1.0), {"radius_m": 0.5, "speed_m_s": 0.1}, CONFIG, State.READY)
     assert changed == CircleTask(center_x_m=1.0, radius_m=0.5, speed_m_s=0.1)
 
 
@@ -42,7 +46,7 @@ def test_the_fields_that_are_given_change_and_the_others_stay():
 def test_an_armed_robot_keeps_its_task(state):
     for task, changes in ((CircleTask(), {"radius_m": 0.5}), (LINE, {"speed_m_s": 0.3})):
         with pytest.raises(TaskRefused, match="disarm first"):
-            changed_task(task, changes, ROBOT, state)
+            changed_task(task, changes, CONFIG, state)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +70,27 @@ def test_an_armed_robot_keeps_its_task(state):
 )
 def test_what_the_robot_cannot_do_is_refused_in_words(changes, message):
     with pytest.raises(TaskRefused, match=message):
-        changed_task(CircleTask(), changes, ROBOT, State.READY)
+        changed_task(CircleTask(), changes, CONFIG, State.READY)
+
+
+@pytest.mark.parametrize(
+    ("turn_ratio", "name", "value"),
+    [(1.0, "speed_m_s", 0.02), (2.0, "speed_m_s", 0.06), (1.0, "center_x_m", 900.0)],
+    ids=["slower than the controller holds", "slower than it holds through a gear", "where no pose reaches"],
+)
+def test_a_change_is_refused_in_the_words_in_which_robot_toml_is(tmp_path, turn_ratio, name, value):
+    link = f'driver = "vesc"\n{EXAMPLES["vesc"]}\n[wheels]\nturn_ratio = {turn_ratio}'
+    file = robot_toml(tmp_path, link)
+    config = load_robot_config(file)
+    with pytest.raises(TaskRefused) as change:
+        changed_task(config.task, {name: value}, config, State.READY)
+    text = re.sub(r"(?m)^\[task\]\n(.+\n)*", f"[task]\n{name} = {value}\n", file.read_text("utf-8"))
+    file.write_text(text, "utf-8")
+    with pytest.raises(InputError) as loading:
+        load_robot_config(file)
+    assert str(loading.value) == f"{file}: task.{change.value}"
+    if least := re.search(r"write at least ([\d.]+)", str(change.value)):
+        assert changed_task(config.task, {name: float(least[1])}, config, State.READY).speed_m_s == float(least[1])
 
 
 def test_the_limits_are_those_that_are_enforced_by_the_outer_wheel():
@@ -75,9 +99,9 @@ def test_the_limits_are_those_that_are_enforced_by_the_outer_wheel():
     assert shown["center_y_m"] == CENTER_M
     slowest, fastest = shown["speed_m_s"]
     assert slowest == SLOWEST_M_S
-    changed_task(CircleTask(), {"speed_m_s": fastest}, ROBOT, State.READY)
+    changed_task(CircleTask(), {"speed_m_s": fastest}, CONFIG, State.READY)
     with pytest.raises(TaskRefused):
-        changed_task(CircleTask(), {"speed_m_s": fastest * 1.001}, ROBOT, State.READY)
+        changed_task(CircleTask(), {"speed_m_s": fastest * 1.001}, CONFIG, State.READY)
     speed, radius_m = CircleTask(radius_m=0.75).fastest_m_s(ROBOT), 0.75
     outer_rad_s = speed / radius_m * (radius_m + 0.5 * ROBOT.axial_distance_m) / ROBOT.wheel_radius_m
     assert outer_rad_s == pytest.approx(ROBOT.max_wheel_speed_rad_s)
@@ -105,15 +129,15 @@ def test_a_record_of_an_old_log_is_understood():
 
 
 def test_of_a_path_only_the_speed_can_be_changed():
-    changed = changed_task(LINE, {"speed_m_s": 0.3}, ROBOT, State.READY)
+    changed = changed_task(LINE, {"speed_m_s": 0.3}, CONFIG, State.READY)
     assert changed == msgspec.structs.replace(LINE, speed_m_s=0.3)
     assert set(limits(ROBOT, LINE)) == {"speed_m_s"}
     fastest = ROBOT.max_wheel_speed_rad_s * ROBOT.wheel_radius_m
     assert limits(ROBOT, LINE)["speed_m_s"] == (SLOWEST_M_S, pytest.approx(fastest))
     with pytest.raises(TaskRefused, match="give one or more of speed_m_s, not radius_m"):
-        changed_task(LINE, {"radius_m": 0.5}, ROBOT, State.READY)
+        changed_task(LINE, {"radius_m": 0.5}, CONFIG, State.READY)
     with pytest.raises(TaskRefused, match="needs more than 8 rad/s of the wheels; write at most"):
-        changed_task(LINE, {"speed_m_s": 1.01 * fastest}, ROBOT, State.READY)
+        changed_task(LINE, {"speed_m_s": 1.01 * fastest}, CONFIG, State.READY)
 
 
 def test_a_status_and_a_record_hold_a_path_without_its_way_points():
@@ -130,7 +154,7 @@ def test_a_status_and_a_record_hold_a_path_without_its_way_points():
 
 def test_of_way_points_by_time_nothing_can_be_changed():
     with pytest.raises(TaskRefused, match="times of the way-points set the speed; change t_s in their CSV"):
-        changed_task(TIMED, {"speed_m_s": 0.3}, ROBOT, State.READY)
+        changed_task(TIMED, {"speed_m_s": 0.3}, CONFIG, State.READY)
     assert limits(ROBOT, TIMED) == {}
     assert TIMED.describe() == "path line.csv of 2.00 m in 10 s, at most 0.2 m/s"
     assert task_in_status(requested_task(TIMED), TIMED) == TIMED

@@ -47,9 +47,9 @@ def test_the_page_names_every_member_of_a_task():
 def test_its_file_is_a_kind_from_robot_toml_to_the_log(square):
     assert "square" in kinds()
     setup = load_setup(square)
-    task, robot = setup.config.task, setup.config.robot
+    task = setup.config.task
     assert (task.side_m, task.speed_m_s) == (1.2, 0.2)
-    changed = changed_task(task, {"side_m": 2.0}, robot, State.READY)
+    changed = changed_task(task, {"side_m": 2.0}, setup.config, State.READY)
     assert changed.side_m == 2.0
     record = record_of(7, changed)
     assert record == records.Task(7, "square", {"side_m": 2.0, "speed_m_s": 0.2})

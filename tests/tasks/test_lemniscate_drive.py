@@ -27,8 +27,8 @@ def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_pa
     stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
     stack.run(1.5)
     with pytest.raises(TaskRefused, match=r"at most .* m/s, or a larger size"):
-        changed_task(stack.core.task, {"speed_m_s": 3.0}, setup.config.robot, State.READY)
-    changed = changed_task(stack.core.task, {"size_m": 0.6, "speed_m_s": 0.26}, setup.config.robot, State.READY)
+        changed_task(stack.core.task, {"speed_m_s": 3.0}, setup.config, State.READY)
+    changed = changed_task(stack.core.task, {"size_m": 0.6, "speed_m_s": 0.26}, setup.config, State.READY)
     stack.core.set_task(changed)
     stack.run(0.5, UserRequest.ARM)
     stack.run(0.02, UserRequest.START)

@@ -214,6 +214,25 @@ def test_two_pages_see_the_same_robot(daemon):
         assert desk.status["state"] == "READY"
 
 
+@pytest.mark.parametrize(("typed", "drawn"), [("7.5", 7.5), ("1e6", 50.0), (f"1{400 * '0'}", 50.0), ("-3", 0.1)])
+def test_what_is_typed_into_the_form_is_drawn_within_the_limits_of_the_daemon(line, typed, drawn):
+    """A figure of a thousand kilometres would take the memory of the process that sends the e-stop, too."""
+    while next_message(line, "status")["state"] != "READY":
+        # The desk knows no limits before the daemon has replied.
+        pass
+    line.send(f'{{"do": "draft", "values": {{"radius_m": {typed}, "speed_m_s": 9, "center_x_m": 1e6}}}}')
+    # The desk takes one message after the other.
+    assert request_reply(line, do="stop")["ok"]
+    assert next_message(line, "status")["draft"] == {"radius_m": drawn}
+
+
+def test_without_limits_no_draft_is_drawn(tmp_path):
+    with desk_of(tmp_path / "none.sock") as (desk, port), line_to(port) as line:
+        line.send(json.dumps({"do": "draft", "values": {"radius_m": 7.5}}))
+        assert not request_reply(line, do="arm")["ok"]
+        assert desk.draft is None
+
+
 def test_nobody_there_asks_nothing_of_the_daemon(daemon, port):
     with line_to(port) as line:
         next_message(line, "status")

@@ -1,5 +1,7 @@
 """Pictures, clips and exported pages of a log, without a browser; test_commands.py has what is in an exported page."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -33,6 +35,14 @@ def test_every_layer_is_in_the_picture(recording, tmp_path):
     assert count(pixels, scene.LAYERS["plan"].colour) > 50
     assert count_shades(pixels, scene.LAYERS["fan"].colour, 0.2) > 60
     assert count(pixels, scene.LAYERS["ellipse"].colour) > 10
+
+
+def test_a_picture_of_a_robot_that_drives_backwards_shows_the_reference_backwards(recording):
+    recording.stage = replace(recording.stage, drives_backwards=True)
+    figure = picture._figure()
+    picture._draw(figure, recording, 1.0)
+    lines = {line.get_label(): line for axes in figure.axes for line in axes.get_lines()}
+    assert set(lines["reference"].get_ydata()) == {-recording.stage.task.speed_m_s}
 
 
 def test_a_longer_log_is_exported_with_pictures_further_apart(recording, tmp_path, monkeypatch):

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -26,6 +28,15 @@ def test_all_curves_are_drawn_up_to_the_instant(plots, timeline):
     for handle, _ in plots._plots:
         assert handle.data[0][-1] >= 3.9, handle.title
         assert len({len(column) for column in handle.data}) == 1
+
+
+def test_the_reference_of_a_robot_that_drives_backwards_is_as_negative_as_its_speed(recording, timeline):
+    stage = replace(recording.stage, drives_backwards=True)
+    with serving("test", port=0) as page:
+        plots = Plots(page.server.gui, stage)
+        plots.show(timeline, timeline.last_ns, CircleTask(speed_m_s=0.3), None)
+        references = [handle.data[2] for handle, _ in plots._plots if handle.title == "Speed (m/s)"]
+    assert [set(reference.tolist()) for reference in references] == [{-0.3}]
 
 
 def test_nothing_known_leaves_the_plots_as_they_are(plots):

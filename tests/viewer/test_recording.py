@@ -55,6 +55,14 @@ def test_the_stage_is_that_of_the_robot_file_and_its_model():
     assert stage.x_icr_m == 0.238, "the model's, not the nominal one"
 
 
+def test_the_stage_knows_which_end_of_the_robot_goes_ahead(tmp_path):
+    robot = tmp_path / "robot.toml"
+    text = ROBOT_FILE.read_text("utf-8").replace('file = "wombot_model.toml"', f'file = "{MODEL_FILE}"')
+    for facing in ("forwards", "backwards"):
+        robot.write_text(text.replace("[control]\n", f'[control]\nfacing = "{facing}"\n'), "utf-8")
+        assert stage_of_robot(robot).drives_backwards is (facing == "backwards")
+
+
 def test_a_log_brings_both_files(recording):
     expected = stage_of_robot(ROBOT_FILE, MODEL_FILE)
     assert recording.stage.task == expected.task

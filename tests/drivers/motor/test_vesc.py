@@ -30,6 +30,13 @@ def test_a_task_that_needs_less_than_the_speed_loop_holds_is_refused_with_what_i
         load_robot_config(robot_toml(tmp_path, f'driver = "vesc"\n{slow}'))
 
 
+def test_way_points_with_times_have_no_one_speed_that_could_be_too_slow(tmp_path):
+    file = robot_toml(tmp_path, f'driver = "vesc"\n{EXAMPLES["vesc"]}')
+    text = file.read_text("utf-8").replace('kind = "circle"', 'kind = "timed_path"\npath = "line.csv"')
+    file.write_text(text.replace("radius_m = 0.75\nspeed_m_s = 0.2\n", ""), "utf-8")
+    assert load_robot_config(file).task.path == "line.csv"
+
+
 @pytest.mark.parametrize("pause_s", [0.13, 0.5])
 def test_a_host_that_paused_for_longer_than_the_timeout_is_disarmed(bench, pause_s):
     bench.drive(1.0, FORWARD)
