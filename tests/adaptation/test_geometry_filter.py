@@ -84,6 +84,21 @@ def test_four_fifths_of_a_change_are_known_after_two_and_a_half_seconds(count, i
     assert index > 0 or min(known_part) > 0.8
 
 
+@pytest.mark.parametrize("seed", [61, *(pytest.param(seed, marks=pytest.mark.thorough) for seed in (62, 63, 64))])
+def test_a_robot_that_is_tracked_at_its_centre_may_be_tracked_elsewhere_from_some_time_on(seed):
+    """What may change is scaled by its size, which is none here."""
+    wide, mean = 0.15 / np.sqrt(3.0) * np.array([NOMINAL[0], NOMINAL[1], 0.2]), np.array([*NOMINAL[:2], 0.0])
+    found = GeometryFilter(mean, np.diag(wide**2), mean - 5.0 * wide, mean + 5.0 * wide)
+    plant = ForeignPlant(ForeignRobot(*mean), (0.0, 0.0, 0.3), seed)
+    drive(found, plant, TURN, 20.0)
+    assert found.mean[2] == pytest.approx(0.0, abs=0.004)
+    assert (found.changes, found.on_slope) == (0, False)
+    changed(plant, x_icr_m=0.05)
+    drive(found, plant, TURN, 10.0)
+    assert found.mean[2] == pytest.approx(0.05, abs=0.006)
+    assert not found.on_slope
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "most_error", "most_known_s"), [("axle_m -15 %", 0.015, 8.0), ("poses 2 Hz, 25 mm", 0.03, None)]
