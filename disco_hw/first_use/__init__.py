@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import time
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +28,6 @@ from drivers.transport import SerialMedium, TransportSettingsError, create_trans
 from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, MotorDriver
-
-_SECTION = re.compile(r"^\s*\[([^\[\]]+)\]\s*(#.*)?$")
 
 
 def in_toml(value: Any) -> str:
@@ -56,23 +55,36 @@ def with_fields(text: str, fields: Mapping[tuple[str, str], Any]) -> str:
 
 
 def _set(lines: list[str], section: str, name: str, value: str) -> None:
-    begin = next((k for k, line in enumerate(lines) if _name_of(line) == section), None)
+    tables = {k: table for k in range(len(lines)) if (table := _table_begun(lines, k)) is not None}
+    begin = next((k for k, table in tables.items() if table == {section: {}}), None)
     if begin is None:
         lines += [*([""] if lines and lines[-1] else []), f"[{section}]", f"{name} = {value}"]
         return
-    end = next((k for k in range(begin + 1, len(lines)) if _name_of(lines[k]) is not None), len(lines))
+    end = next((k for k in tables if k > begin), len(lines))
     field = re.compile(rf"^(\s*{re.escape(name)}\s*=\s*)([^#]*?)(\s*#.*)?$")
     for k in range(begin + 1, end):
         found = field.match(lines[k])
-        if found is not None:
+        if found is not None and _parsed(lines[:k]) is not None:
             lines[k] = f"{found[1]}{value}{found[3] or ''}"
             return
     lines.insert(begin + 1, f"{name} = {value}")
 
 
-def _name_of(line: str) -> str | None:
-    found = _SECTION.match(line)
-    return None if found is None else found[1].strip()
+def _table_begun(lines: Sequence[str], k: int) -> dict[str, Any] | None:
+    """Return the empty table, or the list with one, that this line is the header of; None for any other line.
+
+    A line of a value over several lines may look like a header: what is above it is then no TOML by itself.
+    """
+    if not lines[k].lstrip().startswith("[") or (table := _parsed(lines[k : k + 1])) is None:
+        return None
+    return None if _parsed(lines[:k]) is None else table
+
+
+def _parsed(lines: Sequence[str]) -> dict[str, Any] | None:
+    try:
+        return tomllib.loads("\n".join(lines))
+    except ValueError:
+        return None
 
 
 # Chosen: short beside the seconds of listening.

@@ -18,6 +18,7 @@ from disco_hw.daemon.process import STANDARD_ERROR, STANDARD_INPUT, AsyncPrinter
 from disco_hw.daemon.run import in_text, new_log, serve
 from disco_hw.drive.terminal import Keyboard, KeyHold
 from disco_hw.errors import InputError, WorkError
+from disco_hw.fence import Fence
 from disco_hw.files import ROBOT_TOML, read_bytes
 from disco_hw.first_use import in_toml, with_fields
 from disco_hw.first_use.judgement import Findings, evaluate_floor, evaluate_sides, evaluate_turns
@@ -25,6 +26,7 @@ from disco_hw.first_use.procedure import CommissionPilot, Procedure, Steps, floo
 from disco_hw.reports import refuse_directory
 from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
 from drivers.motor import find_driver
+from drivers.pose import AS_OURS
 
 # Chosen: a fault may hide another; what is not mended by then needs a person who looks.
 _MOST_TRIES = 3
@@ -95,17 +97,12 @@ class CommissionResult:
 
 
 def as_sent(setup: Setup) -> Setup:
-    """Return the robot with its poses as the first source sends them, and without those of others."""
-    plain = msgspec.structs.replace(
-        setup.config.pose,
-        position_unit="m",
-        yaw_unit="rad",
-        clockwise=False,
-        mirrored=False,
-        yaw_offset_rad=0.0,
-        also=(),
-    )
-    return replace(setup, config=msgspec.structs.replace(setup.config, pose=plain))
+    """Return the robot with its poses as the first source sends them, without those of others and without the fence.
+
+    While their units, axes and frame are in question, a fence would stop the robot anywhere, or nowhere.
+    """
+    pose = msgspec.structs.replace(setup.config.pose, also=(), **msgspec.structs.asdict(AS_OURS))
+    return replace(setup, config=msgspec.structs.replace(setup.config, pose=pose, fence=Fence()))
 
 
 def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input) -> CommissionResult:
@@ -127,6 +124,10 @@ def run_commission(options: CommissionOptions, ask: Callable[[str], str] = input
         )
     if setup.config.pose.also:
         _print("poses", "only the first source is examined; `disco-hw check` compares those of [[pose.also]] with it")
+    fence = setup.config.fence
+    has_fence = fence.is_set or fence.obstacles_port is not None
+    if has_fence and any(known[name].raw_poses for name in options.stages):
+        _print("fence", f"not in force in the stage floor, which takes poses as they are sent; put the robot {_DOWN}")
     reports: list[dict[str, Any]] = []
     for name in options.stages:
         if not _through(known[name], options, ask, reports):

@@ -250,13 +250,15 @@ def _response(track: Track) -> list[tuple[str, str]]:
 def evaluate_floor(seen: FloorSeen, configured: PoseConvention, robot: Robot) -> Findings:
     """Find the units and axes of the poses, the sensor's place, and its delay.
 
-    The poses are as the source sent them; `configured` is what robot.toml says of them.
+    The poses are as the source sent them; `configured` is what robot.toml says of them. Its `origin` and `offset` are
+    believed, as no drive of this kind shows them.
     """
     legs = (seen.straight, seen.left, seen.right, seen.straight_again)
     if any(len(leg.poses) < 5 for leg in legs):
         where = "no pose received" if not any(leg.poses for leg in legs) else "poses received only now and then"
         return Findings((Fault("no poses", f"{where} while driving; check [pose] and the sender of the poses"),))
-    fits = [fit for choice in _CHOICES if (fit := _fit(seen, choice, robot)) is not None]
+    choices = (msgspec.structs.replace(configured, **units) for units in _CHOICES)
+    fits = [fit for choice in choices if (fit := _fit(seen, choice, robot)) is not None]
     if not fits:
         text = (
             "the poses do not follow the robot in any units or axes; check that the sensor tracks this robot, that "
@@ -295,7 +297,9 @@ _QUARTER = 0.5 * math.pi
 _UNITS = ("position_unit", "yaw_unit", "clockwise", "mirrored")
 _METRES: tuple[Literal["m", "cm", "mm"], ...] = ("m", "cm", "mm")
 _RADIANS: tuple[Literal["rad", "deg"], ...] = ("rad", "deg")
-_CHOICES = tuple(PoseConvention(*units) for units in product(_METRES, _RADIANS, (False, True), (False, True)))
+_CHOICES: tuple[dict[str, Any], ...] = tuple(
+    dict(zip(_UNITS, units, strict=True)) for units in product(_METRES, _RADIANS, (False, True), (False, True))
+)
 
 
 @dataclass(frozen=True)
@@ -314,27 +318,29 @@ def _same_units(found: PoseConvention, configured: PoseConvention) -> bool:
 
 
 def _fit(seen: FloorSeen, choice: PoseConvention, robot: Robot) -> _Fit | None:
-    """Return the drive in this convention; None where distance or turn cannot be so."""
+    """Return the drive in this convention, with the yaw offset that it shows if that is another than the choice's own.
+
+    None where distance or turn cannot be so.
+    """
     wheels_m = _travel(seen.straight, robot)
-    dx, dy, heading = _displacement(seen.straight.poses, choice)
-    poses_m = math.hypot(dx, dy)
-    if wheels_m <= 0.0 or not 0.3 < poses_m / wheels_m < 3.0:
+    turns = [[choice.converted(pose) for pose in track.poses] for track in (seen.left, seen.right)]
+    left, right = map(_turn, turns)
+    if wheels_m <= 0.0 or not (0.2 < left / math.pi < 2.0 and 0.2 < -right / math.pi < 2.0):
         return None
-    left, right = _turn(seen.left.poses, choice), _turn(seen.right.poses, choice)
-    if not (0.2 < left / math.pi < 2.0 and 0.2 < -right / math.pi < 2.0):
+    arm = _arm(turns)
+    straights = [[choice.converted(pose) for pose in track.poses] for track in (seen.straight, seen.straight_again)]
+    (poses_m, first), (_, second) = (_displacement(poses, arm) for poses in straights)
+    if not 0.3 < poses_m / wheels_m < 3.0:
         return None
-    again_x, again_y, again_heading = _displacement(seen.straight_again.poses, choice)
-    first, second = math.atan2(dy, dx) - heading, math.atan2(again_y, again_x) - again_heading
-    offset = math.atan2(math.sin(first) + math.sin(second), math.cos(first) + math.cos(second))
-    near = _QUARTER * round(offset / _QUARTER)
-    offset = near if abs(offset - near) < _OFFSET_RAD else offset
-    return _Fit(
-        msgspec.structs.replace(choice, yaw_offset_rad=math.remainder(offset, 2 * math.pi)),
-        abs(math.remainder(first - second, 2.0 * math.pi)),
-        wheels_m,
-        poses_m,
-        0.5 * (left - right),
-    )
+    aside = math.atan2(math.sin(first) + math.sin(second), math.cos(first) + math.cos(second))
+    found = choice
+    if abs(aside) > _OFFSET_RAD:
+        offset = choice.yaw_offset_rad + aside
+        near = _QUARTER * round(offset / _QUARTER)
+        offset = math.remainder(near if abs(offset - near) < _OFFSET_RAD else offset, 2.0 * math.pi)
+        found = msgspec.structs.replace(choice, yaw_offset_rad=offset)
+    mismatch_rad = abs(math.remainder(first - second, 2.0 * math.pi))
+    return _Fit(found, mismatch_rad, wheels_m, poses_m, 0.5 * (left - right))
 
 
 def _travel(track: Track, robot: Robot) -> float:
@@ -342,26 +348,27 @@ def _travel(track: Track, robot: Robot) -> float:
     return 0.5 * (left + right) * robot.wheel_radius_m
 
 
-def _displacement(poses: Sequence[PoseSample], choice: PoseConvention) -> tuple[float, float, float]:
-    """Return the way from the first poses' mean, at rest, to the last ones', with the mean heading (m, m, rad)."""
+def _displacement(poses: Sequence[PoseSample], arm: tuple[float, float]) -> tuple[float, float]:
+    """Return the distance (m) by which the point about which the robot turns has moved, and its direction (rad).
+
+    It moves from the first poses' mean, at rest, to the last ones'. The direction is relative to the mean heading: this
+    point alone moves where the robot heads, also along a curve.
+    """
     rest = max(1, min(10, len(poses) // 4))
-    found = [choice.converted(pose) for pose in poses]
-    first, last = found[:rest], found[-rest:]
-    dx = _mean([p.x_m for p in last]) - _mean([p.x_m for p in first])
-    dy = _mean([p.y_m for p in last]) - _mean([p.y_m for p in first])
-    heading = math.atan2(_mean([math.sin(p.yaw_rad) for p in found]), _mean([math.cos(p.yaw_rad) for p in found]))
-    return dx, dy, heading
+    cosines, sines = [math.cos(p.yaw_rad) for p in poses], [math.sin(p.yaw_rad) for p in poses]
+    x = [p.x_m - c * arm[0] + s * arm[1] for p, c, s in zip(poses, cosines, sines, strict=True)]
+    y = [p.y_m - s * arm[0] - c * arm[1] for p, c, s in zip(poses, cosines, sines, strict=True)]
+    dx, dy = (_mean(along[-rest:]) - _mean(along[:rest]) for along in (x, y))
+    return math.hypot(dx, dy), math.atan2(dy, dx) - math.atan2(_mean(sines), _mean(cosines))
 
 
 def _mean(values: Sequence[float]) -> float:
     return math.fsum(values) / len(values)
 
 
-def _turn(poses: Sequence[PoseSample], choice: PoseConvention) -> float:
+def _turn(poses: Sequence[PoseSample]) -> float:
     """Return by how much the yaw has changed (rad), over the steps from pose to pose."""
-    factor = (-1.0 if choice.clockwise else 1.0) * (math.pi / 180.0 if choice.yaw_unit == "deg" else 1.0)
-    yaws = [factor * pose.yaw_rad for pose in poses]
-    return math.fsum(math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(yaws))
+    return math.fsum(math.remainder(b.yaw_rad - a.yaw_rad, 2.0 * math.pi) for a, b in pairwise(poses))
 
 
 def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
@@ -378,7 +385,7 @@ def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
         if getattr(found.convention, key) != getattr(configured, key)
     ]
     offset = found.convention.yaw_offset_rad
-    if abs(math.remainder(offset - configured.yaw_offset_rad, 2.0 * math.pi)) > _OFFSET_RAD:
+    if offset != configured.yaw_offset_rad:
         faults.append(
             Fault(
                 "sensor looks aside",
@@ -393,35 +400,40 @@ def _pose_faults(found: _Fit, configured: PoseConvention) -> list[Fault]:
 def _places(seen: FloorSeen, best: _Fit) -> list[str]:
     """Return lines on where the sensor sits beside the centre of the turns, and its delay against the wheels."""
     convention = best.convention
-    arms = [_arm([convention.converted(pose) for pose in track.poses]) for track in (seen.left, seen.right)]
-    forward, left = (_mean([arm[k] for arm in arms]) for k in (0, 1))
+    tracked = _arm([[convention.converted(pose) for pose in track.poses] for track in (seen.left, seen.right)])
+    forward, left = (place + offset for place, offset in zip(tracked, convention.offset, strict=True))
     delays = [_delay_s(track, convention) for track in (seen.left, seen.right)]
     ahead = "ahead of" if forward > 0.0 else "behind"
     aside = "left" if left > 0.0 else "right"
     direction = "behind" if _mean(delays) > 0.0 else "ahead of"
-    poses = seen.straight.poses
+    poses = [convention.converted(pose) for pose in seen.straight.poses]
     rate_hz = (len(poses) - 1) / max(1e-9, (poses[-1].t_ns - poses[0].t_ns) * 1e-9)
     age_ms = median((pose.received_ns - pose.t_ns) * 1e-6 for pose in poses)
     lines = [
         f"lever arm: the sensor is {abs(forward):.2f} m {ahead} and {abs(left):.2f} m to the {aside} of the point "
-        f"about which the robot turns (x_icr_m = {-forward:.2f})",
+        f"about which the robot turns (x_icr_m = {-tracked[0]:.2f})",
         f"poses: {rate_hz:.0f} a second, {age_ms:.0f} ms old on arrival, their stamps "
         f"{abs(1e3 * _mean(delays)):.0f} ms {direction} the wheels'",
     ]
-    if abs(left) > POSE_STD_LEFT_M:
-        lines.append("the sensor is far from the middle of the robot: the circle it drives differs from the robot's")
+    if abs(tracked[1]) > POSE_STD_LEFT_M:
+        lines.append(
+            "the tracked point is far from the middle of the robot: the circle it drives differs from the robot's"
+        )
     return lines
 
 
-def _arm(poses: Sequence[PoseSample]) -> tuple[float, float]:
-    """Least squares of p = c + R(yaw) l: the arm l, forward and left (m)."""
-    rows, values = [], []
-    for pose in poses:
-        c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
-        rows += [[1.0, 0.0, c, -s], [0.0, 1.0, s, c]]
-        values += [pose.x_m, pose.y_m]
-    found = np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0]
-    return float(found[2]), float(found[3])
+def _arm(turns: Sequence[Sequence[PoseSample]]) -> tuple[float, float]:
+    """Return the arm l of p = c + R(yaw) l by least squares, the mean of these turns: forward and left (m)."""
+    arms = []
+    for poses in turns:
+        rows, values = [], []
+        for pose in poses:
+            c, s = math.cos(pose.yaw_rad), math.sin(pose.yaw_rad)
+            rows += [[1.0, 0.0, c, -s], [0.0, 1.0, s, c]]
+            values += [pose.x_m, pose.y_m]
+        arms.append(np.linalg.lstsq(np.array(rows), np.array(values), rcond=None)[0][2:])
+    forward, left = np.mean(arms, axis=0)
+    return float(forward), float(left)
 
 
 def _delay_s(track: Track, convention: PoseConvention) -> float:

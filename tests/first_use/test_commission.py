@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 import random
+from dataclasses import replace
+from itertools import product
 
+import msgspec
 import pytest
 
 from disco_hw.errors import InputError, WorkError
 from disco_hw.first_use.commission import STAGES, CommissionOptions, as_sent, run_commission, write_fields
-from disco_hw.first_use.procedure import MOST_SHARE, CommissionPilot, Procedure
+from disco_hw.first_use.procedure import MOST_SHARE, CommissionPilot, FloorSeen, Procedure, Track
 from disco_hw.log.records import Event
+from disco_hw.runtime.assembly import pose_source_of
 from disco_hw.runtime.robot_setup import load_setup
+from drivers.types import PoseSample, WheelSample
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
 from tests.first_use.miswired import Miswiring, robot_file, stage
@@ -141,6 +146,117 @@ def test_a_pose_wrong_in_every_way_is_mended_at_once(path):
     }
     assert load_setup(path).config.pose.yaw_offset_rad == pytest.approx(math.pi / 2, abs=1e-3)
     assert path.with_name("robot.toml.before").exists()
+
+
+def goes_away(_prompt):
+    raise EOFError
+
+
+STEP_NS = 50_000_000
+X_ICR_M, OFFSET, LATENCY_S = 0.12, (0.6, 0.2), 0.1
+PER_METRE, PER_RADIAN = {"m": 1.0, "cm": 100.0, "mm": 1000.0}, {"rad": 1.0, "deg": 180.0 / math.pi}
+VALUES = {"position_unit": PER_METRE, "yaw_unit": PER_RADIAN, "clockwise": (False, True), "mirrored": (False, True)}
+UNITS = [dict(zip(VALUES, units, strict=True)) for units in product(*VALUES.values())]
+PLACE = {"origin": (3.0, -2.0, 0.6), "offset": OFFSET, "latency_s": LATENCY_S}
+
+
+def with_pose(path, **fields):
+    """The robot with these fields in [pose]."""
+    setup = load_setup(path)
+    pose = msgspec.structs.replace(setup.config.pose, source="robot", **fields)
+    return replace(setup, config=msgspec.structs.replace(setup.config, pose=pose))
+
+
+def sent(pose, x, y, yaw, t_ns):
+    """What the sensor of a right [pose] sends while the tracked point is there."""
+    (ahead, left), (at_x, at_y, turn) = pose.offset, pose.origin
+    x, y = (
+        x + ahead * math.cos(yaw) - left * math.sin(yaw) - at_x,
+        y + ahead * math.sin(yaw) + left * math.cos(yaw) - at_y,
+    )
+    x, y = math.cos(turn) * x + math.sin(turn) * y, math.cos(turn) * y - math.sin(turn) * x
+    angle = math.remainder((yaw - turn - pose.yaw_offset_rad) * (-1.0 if pose.clockwise else 1.0), 2.0 * math.pi)
+    metres, t_ns = PER_METRE[pose.position_unit], t_ns + round(1e9 * pose.latency_s)
+    y = -y if pose.mirrored else y
+    return PoseSample(t_ns, t_ns, metres * x, metres * y, PER_RADIAN[pose.yaw_unit] * angle, metres * 0.01, 0.01)
+
+
+def floor_drive(true, written):
+    """The drive on the floor by a robot that goes a little to the left; `written`: what robot.toml says of `true`."""
+    robot, source = true.config.robot, pose_source_of(as_sent(written).config)
+    x, y, yaw, left, right, t_ns = 0.5, 0.3, 0.4, 0.0, 0.0, 0
+
+    def leg(way_m, turn_rad):
+        nonlocal x, y, yaw, left, right, t_ns
+        track, moving = Track(), 12
+        for step in range(3 * moving):
+            share = 1.0 / moving if moving <= step < 2 * moving else 0.0
+            way, turn = share * way_m, share * turn_rad
+            x, y = x + way * math.cos(yaw + 0.5 * turn), y + way * math.sin(yaw + 0.5 * turn)
+            apart = 0.5 * turn * robot.axial_distance_m
+            left, right = left + (way - apart) / robot.wheel_radius_m, right + (way + apart) / robot.wheel_radius_m
+            yaw, t_ns = yaw + turn, t_ns + STEP_NS
+            track.wheels.append(WheelSample(t_ns, t_ns, left, right, 0.0, 0.0))
+            tracked = x - X_ICR_M * math.cos(yaw), y - X_ICR_M * math.sin(yaw), yaw
+            track.poses += source.receive(t_ns, [sent(true.config.pose, *tracked, t_ns)])
+        return track
+
+    straight, turned_left, turned_right = leg(0.5, 0.2), leg(0.0, math.pi), leg(0.0, -math.pi)
+    leg(0.0, 0.5 * math.pi)
+    return STAGES[-1].evaluate(FloorSeen(straight, turned_left, turned_right, leg(0.25, 0.1)), written)
+
+
+@pytest.mark.parametrize("yaw_offset_rad", [0.0, 2.0])
+@pytest.mark.parametrize("offset", [(0.0, 0.0), OFFSET])
+@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), PLACE["origin"]])
+def test_a_right_robot_toml_is_right_in_all_units_and_axes(path, origin, offset, yaw_offset_rad):
+    ahead_m = offset[0] - X_ICR_M
+    for units in UNITS:
+        place = {"origin": origin, "offset": offset, "latency_s": LATENCY_S}
+        right = with_pose(path, **units, **place, yaw_offset_rad=yaw_offset_rad)
+        found = floor_drive(right, right)
+        assert not found.faults, units
+        assert (
+            f"{abs(ahead_m):.2f} m {'ahead of' if ahead_m > 0.0 else 'behind'} and {offset[1]:.2f} m"
+            in found.figures[2]
+        )
+        assert "(x_icr_m = 0.12)" in found.figures[2], units
+        assert "100 ms old on arrival, their stamps 0 ms" in found.figures[3]
+        assert len(found.figures) == 4
+
+
+@pytest.mark.parametrize("name", [*VALUES, "yaw_offset_rad"])
+def test_a_wrong_field_is_named_with_the_value_that_is_right_beside_the_others(path, name):
+    for units in UNITS:
+        fields = {**units, **PLACE, "yaw_offset_rad": 0.7}
+        for wrong in {*VALUES.get(name, (2.0, -1.0))} - {fields[name]}:
+            found = floor_drive(with_pose(path, **fields), with_pose(path, **{**fields, name: wrong}))
+            assert found.edits == pytest.approx({("pose", name): fields[name]}, abs=5e-3), (units, wrong)
+
+
+def test_all_wrong_fields_together_become_those_of_the_sensor(path):
+    for units in UNITS:
+        right, written = with_pose(path, **units, **PLACE, yaw_offset_rad=0.7), with_pose(path, **PLACE)
+        edits = {name: value for (_, name), value in floor_drive(right, written).edits.items()}
+        assert edits.pop("yaw_offset_rad") == pytest.approx(0.7, abs=5e-3), units
+        assert edits.items() == units.items() - UNITS[0].items()
+
+
+def test_a_yaw_offset_that_is_as_near_as_a_short_drive_shows_is_believed(path):
+    assert not floor_drive(with_pose(path, yaw_offset_rad=0.1), with_pose(path, yaw_offset_rad=0.25)).faults
+
+
+def test_a_fence_in_another_frame_than_that_of_the_poses_as_sent_is_not_in_force(tmp_path, path, monkeypatch, capsys):
+    path.write_text(
+        path.read_text(encoding="utf-8") + "[fence]\nkeep_in = [[-2, -2], [2, -2], [2, 2], [-2, 2]]\n", encoding="utf-8"
+    )
+    assert load_setup(path).config.fence.is_set
+    assert not as_sent(load_setup(path)).config.fence.is_set
+    monkeypatch.setattr("os.isatty", lambda _descriptor: True)
+    for stages, is_said in ((("turns",), False), (("floor",), True)):
+        with pytest.raises(EOFError):
+            run_commission(CommissionOptions(path, stages=stages, log_directory=tmp_path / "logs"), goes_away)
+        assert ("not in force in the stage floor" in capsys.readouterr().err) is is_said
 
 
 @pytest.mark.long
@@ -275,10 +391,6 @@ def test_of_several_pose_sources_the_first_alone_is_looked_at_which_is_said(tmp_
     setup = load_setup(path)
     assert (len(setup.config.pose.also), as_sent(setup).config.pose.also) == (1, ())
     monkeypatch.setattr("os.isatty", lambda _descriptor: True)
-
-    def goes_away(_prompt):
-        raise EOFError
-
     with pytest.raises(EOFError):
         run_commission(CommissionOptions(path, log_directory=tmp_path / "logs"), goes_away)
     assert "only the first source is examined" in capsys.readouterr().err
