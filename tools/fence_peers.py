@@ -88,10 +88,7 @@ def mujoco_task_drive(rng: np.random.Generator, seconds: float) -> FencedDrive:
     robot = mujoco_robots(int(rng.integers(1 << 20)), 1)[0]
     fence, task = random_task_room(rng, _FOOTPRINT)
     settings = DiscoSettings()
-    around = Surroundings(
-        _FOOTPRINT, fence.margin_m, fence.max_breach_probability, settings.step_s, settings.sampler.horizon,
-        task.speed_m_s,
-    )  # fmt: skip
+    around = Surroundings(_FOOTPRINT, settings.step_s, settings.sampler.horizon, task.speed_m_s)
     around.set_line(task.course().outline_m())
     planner = Disco(model(robot), task.planned("default"), settings, LIMITS, 1, around)
     plant = mujoco_plant(robot, task.course().start, int(rng.integers(1 << 30)))

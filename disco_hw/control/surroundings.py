@@ -40,15 +40,13 @@ TRAPPED_PART = 0.5
 class Surroundings:
     """Fence and obstacles that a planner keeps away from, in the buffers that its kernel reads.
 
-    `max_breach_probability`: of a plan over its horizon; with the pose's deviation it makes the distance to keep.
+    The fence's margin, and its breach probability with the pose's deviation, make the distance to keep.
     `turned_rad`: from the line's direction to the heading in which the robot follows it, pi backwards.
     """
 
     def __init__(
         self,
         footprint: Footprint,
-        margin_m: float,
-        max_breach_probability: float,
         step_s: float,
         horizon: int,
         speed_m_s: float,
@@ -58,8 +56,7 @@ class Surroundings:
         """The task's speed."""
         self._detours = Detours(footprint, turned_rad)
         self._footprint = footprint
-        self._margin_m = margin_m
-        self._deviations = NormalDist().inv_cdf(1.0 - max_breach_probability)
+        self._margin_m = self._deviations = 0.0
         self._horizon = horizon
         self.trapped_cost = TOUCH_COST * TRAPPED_PART * horizon / LOOK_EVERY
         """Cost from which on a sequence touches something for most of the horizon; from TOUCH_COST on it touches."""
@@ -84,6 +81,8 @@ class Surroundings:
         circles = bounds.circles
         if bounds is not self._bounds:
             self._bounds, self._edges, self._circles = bounds, _edges(bounds), None
+            self._margin_m = bounds.fence.margin_m
+            self._deviations = NormalDist().inv_cdf(1.0 - bounds.fence.max_breach_probability)
         seen = circles.tobytes()
         if seen != self._circles:
             self._circles = seen

@@ -275,6 +275,8 @@ class Daemon:
                 text = area.override(now_ns, message.arguments["override"] is True)
             else:
                 text = area.change_fence(now_ns, message.arguments, self._core.state)
+                fault = task_breach(area.fence, self._core.config.footprint_along_line, self._core.course)
+                text += "" if fault is None else f"; the task does not fit into it: {fault}"
         except (ObstacleRefused, FenceRefused) as refused:
             self._server.reply(message, {"ok": False, "error": str(refused)})
             return

@@ -81,8 +81,6 @@ def create_surroundings(config: RobotConfig, settings: control.DiscoSettings) ->
         return None
     around = Surroundings(
         config.robot.footprint,
-        config.fence.margin_m,
-        config.fence.max_breach_probability,
         settings.step_s,
         settings.sampler.horizon,
         config.task.speed_m_s,

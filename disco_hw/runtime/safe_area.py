@@ -30,6 +30,7 @@ class SafeArea:
     def __init__(self, guard: FenceGuard, fence: Fence, footprint: Footprint) -> None:
         self.guard = guard
         self.fence = fence
+        self._is_planned_around = fence != Fence()
         self.footprint = footprint
         self.obstacles = Obstacles()
         self._override_until_ns: int | None = None
@@ -145,7 +146,10 @@ class SafeArea:
         self.guard.set_boundaries(Boundaries(self.footprint, fence), fence.margin_m)
         self._pending.append(record_of_fence(now_ns, fence))
         self._events.append("fence: changed until the daemon ends; robot.toml is not changed")
-        return "the fence is changed until the daemon ends; write it into robot.toml to keep it"
+        text = "the fence is changed until the daemon ends; write it into robot.toml to keep it"
+        if self._is_planned_around:
+            return text
+        return f"{text}, and to have plans avoid it: now only the guard keeps the robot inside"
 
     def status(self, now_ns: int) -> dict[str, Any]:
         """Return the entries for fence and obstacles of the daemon's status."""

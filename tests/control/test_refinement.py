@@ -224,8 +224,8 @@ def _before_a_wall(room_to_stop_m: float, speed_m_s: float = SPEED_M_S) -> Surro
     settings, keep_m = DiscoSettings(), 0.05
     way_m = STEPS * settings.step_s * speed_m_s
     wall_m = FOOTPRINT.ahead + 0.5 * FOOTPRINT.length + keep_m + way_m + room_to_stop_m
-    room = Fence(keep_in=((-5.0, -5.0), (wall_m, -5.0), (wall_m, 5.0), (-5.0, 5.0)))
-    around = Surroundings(FOOTPRINT, keep_m, 1e-3, settings.step_s, settings.sampler.horizon, speed_m_s)
+    room = Fence(keep_in=((-5.0, -5.0), (wall_m, -5.0), (wall_m, 5.0), (-5.0, 5.0)), margin_m=keep_m)
+    around = Surroundings(FOOTPRINT, settings.step_s, settings.sampler.horizon, speed_m_s)
     around.look_around(Boundaries(FOOTPRINT, room, ()), 0.0)
     return around
 

@@ -44,7 +44,7 @@ def bounds_of(fence: Fence = NOTHING, obstacles=()) -> Boundaries:
 
 
 def around(fence: Fence, obstacles=(), deviation_m: float = 0.0) -> Surroundings:
-    found = Surroundings(FOOTPRINT, 0.05, 1e-3, 0.1, 40, 0.2)
+    found = Surroundings(FOOTPRINT, 0.1, 40, 0.2)
     found.look_around(bounds_of(fence, obstacles), deviation_m)
     return found
 
@@ -71,6 +71,9 @@ def test_of_many_shapes_the_nearest_are_kept():
 def test_the_distance_to_keep_follows_from_the_probability_asked_for():
     assert around(Fence(keep_in=ROOM)).area.body[3] == pytest.approx(0.05)
     assert around(Fence(keep_in=ROOM), deviation_m=0.01).area.body[3] == pytest.approx(0.05 + 3.0902 * 0.01, rel=1e-4)
+    changed = around(Fence(keep_in=ROOM))
+    changed.look_around(bounds_of(Fence(keep_in=ROOM, margin_m=0.25, max_breach_probability=0.05)), 0.01)
+    assert changed.area.body[3] == pytest.approx(0.25 + 1.6449 * 0.01, rel=1e-4)
 
 
 @pytest.mark.parametrize("yaw", [0.0, math.pi])

@@ -325,6 +325,13 @@ def test_the_fence_is_changed_while_disarmed_only():
     assert events == ("fence: changed until the daemon ends; robot.toml is not changed",)
 
 
+@pytest.mark.parametrize(("of_robot_toml", "is_planned_around"), [(Fence(keep_in=ROOM), True), (Fence(), False)])
+def test_a_new_fence_that_plans_do_not_avoid_is_said_to_be_one(of_robot_toml, is_planned_around):
+    text = area_of(of_robot_toml).change_fence(0, {"margin_m": 0.1}, State.READY)
+    assert text.startswith("the fence is changed until the daemon ends; write it into robot.toml to keep it")
+    assert text.endswith("now only the guard keeps the robot inside") is not is_planned_around
+
+
 def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     from disco_hw.errors import InputError
     from disco_hw.first_use.fence_drive import fence_of_log, fence_toml

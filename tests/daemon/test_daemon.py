@@ -1,4 +1,4 @@
-"""How the wheels stop when the daemon ends, on every vendor's simulated controllers and in simulated time."""
+"""The daemon on vendors' simulated controllers and in simulated time: how it stops the wheels, and what it answers."""
 
 from types import SimpleNamespace
 
@@ -85,6 +85,16 @@ class Driven:
 @pytest.fixture(params=SPEEDS_RAD_S)
 def name(request):
     return request.param
+
+
+def test_of_a_fence_into_which_the_task_does_not_fit_that_is_said(tmp_path):
+    driven, replies = Driven(tmp_path, "agilex"), []
+    driven.daemon._server = SimpleNamespace(reply=lambda _message, body: replies.append(body["text"]))
+    for radius_m in (3.0, 0.8):
+        fence = {"keep_in": {"center": [0.0, 0.0], "radius_m": radius_m}}
+        driven.daemon._change_area(driven.now_ns(), SimpleNamespace(action="fence", arguments=fence))
+    assert "the task does not fit into it" not in replies[0]
+    assert "; the task does not fit into it: the task" in replies[1]
 
 
 def fails(*_arguments, **_options):
