@@ -257,7 +257,8 @@ def drive(
         wheel_radius_m=float(mean[1]),
         axial_distance_m=float(mean[2]),
     )
-    start = BodyPose(task.center_x_m + task.radius_m, task.center_y_m, 0.5 * math.pi)
+    start = BodyPose(*config.task_start)
+    speed_m_s = -task.speed_m_s if config.turned_rad else task.speed_m_s
     run = SimulatedRun(
         setup,
         virtual_robot(setup, plant, start, effects=effects, seed=seed),
@@ -270,7 +271,7 @@ def drive(
         for _ in run.ticks(duration_s, *requests):
             truth = run.robot.truth
             distance = math.hypot(truth.x_m - task.center_x_m, truth.y_m - task.center_y_m) - task.radius_m
-            cost = math.hypot(distance, truth.speed_m_s - task.speed_m_s)
+            cost = math.hypot(distance, truth.speed_m_s - speed_m_s)
             rows.append((run.now_us * 1e-6 - _START_S, cost, truth.x_m, truth.y_m))
 
     period_s = 1.0 / config.control.rate_hz

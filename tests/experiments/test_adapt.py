@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace as replaced
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -44,6 +47,14 @@ def test_an_adapted_run_replays_bit_for_bit_and_not_without_its_beliefs(tmp_path
     assert report.ticks == len(ticks)
     without = [(now, [one for one in tick if not isinstance(one, records.BeliefChange)]) for now, tick in ticks]
     assert not replay(write_log(tmp_path / "without.mcap", without)).ok
+
+
+def test_a_robot_that_drives_backwards_is_judged_by_its_speed_backwards():
+    setup = load_setup(SHIPPED_ROBOT)
+    control = msgspec.structs.replace(setup.config.control, facing="backwards")
+    setup = replaced(setup, config=msgspec.structs.replace(setup.config, control=control))
+    run = drive(setup, {}, AdaptOptions(change_s=3.0, settled_s=1.0, compared_s=2.0, seeds=1), adapted=False, seed=1)
+    assert run.cost[run.t_s > 4.0].max() < 0.1
 
 
 def made_up(loss: float, adapted: float) -> AdaptRun:
