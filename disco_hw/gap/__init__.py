@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -385,6 +387,17 @@ FLEET_WRITTEN = ("fleet.json", "fleet.txt")
 Spread = Callable[[Callable[[_Task, DriveLog], GapReport | str], _Task, Sequence[DriveLog]], Iterable[GapReport | str]]
 
 
+def _unique_names(stems: Sequence[str]) -> list[str]:
+    """Return a name for each stem: those that several logs have are numbered, past names that are taken."""
+    often = Counter(stems)
+    taken, names = {stem for stem in stems if often[stem] == 1}, []
+    for stem in stems:
+        numbered = (f"{stem}-{k}" for k in count(1))
+        names.append(stem if often[stem] == 1 else next(name for name in numbered if name not in taken))
+        taken.add(names[-1])
+    return names
+
+
 def gap_fleet(
     logs: Sequence[Path],
     robot: Path,
@@ -400,12 +413,7 @@ def gap_fleet(
     """
     task, loaded = _prepared(logs, robot, out, model, FLEET_WRITTEN)
     drives, report_progress = [loaded([log]) for log in logs], progress or (lambda text: None)
-    # Logs of two directories may have one name.
-    stems = [log.stem for log in logs]
-    places = [
-        out / (stem if stems.count(stem) == 1 else f"{stem}-{1 + stems[:k].count(stem)}")
-        for k, stem in enumerate(stems)
-    ]
+    places = [out / name for name in _unique_names([log.stem for log in logs])]
     for place in places:
         refuse_directory(place, WRITTEN, logs)
     rows = []

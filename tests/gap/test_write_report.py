@@ -138,6 +138,14 @@ def test_a_fleet_s_json_has_the_numbers_and_every_log_its_report(fleet, tmp_path
     assert not (out / "short").exists()
 
 
+def test_no_two_logs_of_a_fleet_share_a_directory(monkeypatch, tmp_path):
+    monkeypatch.setattr(gap, "load_drive", lambda paths, *_: paths[0])
+    monkeypatch.setattr(gap, "find_gap", lambda *_, **__: report_of("motor_lag", 0.02, 0.01))
+    logs = [tmp_path / name for name in ("a/run.csv", "b/run.csv", "c/run-2.csv", "d/run-2-1.csv", "e/run.csv")]
+    places = [row.directory.name for row in gap.gap_fleet(logs, SHIPPED_ROBOT, tmp_path / "out").rows]
+    assert places == ["run-1", "run-3", "run-2", "run-2-1", "run-4"]
+
+
 def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
     inside = tmp_path / "out" / "drive" / "model.toml"
     inside.parent.mkdir(parents=True)
