@@ -112,7 +112,7 @@ def find_gap(
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
     offered = offered_stage(gap or _of_wheels(wheels), kept.adds_to_timed, settings)
     amended, remarks = model_of(offered, model, *written)
-    remains, events = None, rare_events(analysis.channels)
+    remains, events = None, rare_events(analysis.channels, log.sources, log.begins_s)
     if gap and written[2] is not None:
         handed_out = "written" if offered == "amended" and "written" in gap else offered
         ahead_s = reached_horizon_s(gap, settings.prediction)
