@@ -22,7 +22,7 @@ from disco_hw.config import load_robot_config
 from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.report import FleetResult, FleetRow, GapReport, Provenance, reached_horizon_s
+from disco_hw.gap.report import FleetResult, FleetRow, GapReport, Provenance, handed_out, reached_horizon_s
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.blind_spots import being_proved, boldest_claims, finder
 from disco_hw.gap.report.events import main_event, rare_events
@@ -114,9 +114,8 @@ def find_gap(
     amended, remarks = model_of(offered, model, *written)
     remains, events = None, rare_events(analysis.channels, log.sources, log.begins_s)
     if gap and written[2] is not None:
-        handed_out = "written" if offered == "amended" and "written" in gap else offered
         ahead_s = reached_horizon_s(gap, settings.prediction)
-        timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out, "floor"))
+        timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out(offered, gap), "floor"))
         remains = Remains.of(timed, left, noise, written[2].errors_of_body(offered))
         if remains is not None:
             remains = replace(remains, event=main_event(events, remains.channel))

@@ -166,6 +166,14 @@ def test_a_log_of_a_fleet_without_poses_is_told_by_its_wheels():
     assert row.as_dict()["held_out"]["timed"]["position_rmse_m"] == pytest.approx(0.020)
 
 
+@pytest.mark.parametrize(("offered", "shown"), [("amended", "80.0 mm 160 mrad"), ("timed", "20.0 mm 40 mrad")])
+def test_a_fleet_shows_the_errors_of_the_model_that_is_in_the_directory(offered, shown):
+    found = report_of("motor_lag", 0.020, 0.010, offered)
+    whole = replace(found, gap=found.gap | {"written": found.gap["refitted"]})
+    for judged in (whole, replace(whole, gap={}, wheels=whole.gap)):
+        assert FleetRow(Path("drive.mcap"), Path("out/drive"), judged).cells()[5] == shown
+
+
 # Each worker imports and compiles the search anew.
 @pytest.mark.long
 @pytest.mark.timeout(900)

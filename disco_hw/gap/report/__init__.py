@@ -31,6 +31,11 @@ def reached_horizon_s(gap: Mapping[str, Mapping[float, PredictionErrors]], setti
     return max(reached, default=settings.reported_horizon_s)
 
 
+def handed_out(offered: str, errors: Mapping[str, object]) -> str:
+    """Return the stage whose errors are those of model.toml: the amended model counts as it is written."""
+    return "written" if offered == "amended" and "written" in errors else offered
+
+
 @dataclass(frozen=True, slots=True)
 class ChannelFinding:
     """Whether simulation and data disagree in a channel, and in which regimes most."""
@@ -307,7 +312,7 @@ class FleetRow:
             ", ".join(one.name for one in report.doubtful) or "-",
             f"{horizon_s:g} s",
             cell("timed"),
-            cell(offered),
+            cell(handed_out(offered, errors)),
             cell("floor"),
             report.offered,
         )
