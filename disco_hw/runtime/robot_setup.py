@@ -16,7 +16,15 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from disco_hw.config import PoseInput, Robot, RobotConfig, link_fields, load_robot_config, refuse_outside_task
+from disco_hw.config import (
+    PoseInput,
+    Robot,
+    RobotConfig,
+    link_fields,
+    load_robot_config,
+    model_file_of,
+    refuse_outside_task,
+)
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import fence_outlines, footprint_outline
 from disco_hw.files import KEY, WAY_POINTS, read_bytes
@@ -55,9 +63,7 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     config = load_robot_config(robot)
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
-    model_file = model
-    if model_file is None and config.model.file is not None:
-        model_file = robot.parent / config.model.file
+    model_file = model_file_of(robot, config, model)
     config = msgspec.structs.replace(config, pose=_with_key_from_file(robot, config.pose))
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
     if config.task.file is None:

@@ -17,7 +17,7 @@ from disco_hw.gap.report import STAGES, EffectFinding, FleetRow, GapReport, LowC
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.log.importing import write_log
-from disco_hw.model import Model
+from disco_hw.model import EffectSetting, Model, save_model
 from tools.gap.strange_robot import record
 from tools.joystick import joystick
 
@@ -53,6 +53,41 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
         gap.gap([], robot, tmp_path, given)
     with pytest.raises(EnoughError):
         gap.gap([], robot, tmp_path / "gap", given)
+
+
+def robot_with_model(directory, name):
+    """A robot.toml whose model of this name has a dead band."""
+    model = replace(Model(0.06, 0.4), effects=(EffectSetting("deadband", {"width_rad_s": 0.8}),))
+    (directory / name).parent.mkdir(exist_ok=True)
+    save_model(model, directory / name)
+    robot = directory / "robot.toml"
+    robot.write_text(SHIPPED_ROBOT.read_text("utf-8").replace("wombot_model.toml", name), "utf-8")
+    return robot
+
+
+def test_the_search_starts_from_robot_toml_s_model_unless_another_is_given(monkeypatch, tmp_path):
+    handed = []
+
+    def search(_, model, *__, **___):
+        handed.append([setting.name for setting in model.effects])
+        return report_of("motor_lag", 0.02, 0.01)
+
+    monkeypatch.setattr(gap, "load_drive", lambda *_: None)
+    monkeypatch.setattr(gap, "find_gap", search)
+    robot, other = robot_with_model(tmp_path, "known.toml"), SHIPPED_ROBOT.parent / "wombot_model.toml"
+    used = [gap.gap([], robot, tmp_path / "out", model).report.provenance for model in (None, other)]
+    assert [one.model_file for one in used] == [str(tmp_path / "known.toml"), str(other)]
+    gap.gap_fleet([tmp_path / "a.csv"], robot, tmp_path / "fleet")
+    assert handed == [["deadband"], [], ["deadband"]]
+
+
+def test_robot_toml_s_model_is_not_written_over(monkeypatch, tmp_path):
+    monkeypatch.setattr(gap, "load_drive", lambda *_: None)
+    refusal = r"model\.toml: is read here and would be overwritten"
+    with pytest.raises(InputError, match=refusal):
+        gap.gap([], robot_with_model(tmp_path, "model.toml"), tmp_path)
+    with pytest.raises(InputError, match=refusal):
+        gap.gap_fleet([tmp_path / "run.csv"], robot_with_model(tmp_path, "run/model.toml"), tmp_path)
 
 
 def report_of(name, timed_m, amended_m, offered="amended"):
