@@ -6,6 +6,7 @@ This module has the report as data: verdict, effects with intervals, unnamed ter
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -104,7 +105,7 @@ class Provenance:
     @property
     def go_on(self) -> str:
         """The command that drives with the model that is handed out."""
-        return f"disco-hw run {self.robot_file} --model {self.directory}/model.toml"
+        return shlex.join(("disco-hw", "run", self.robot_file, "--model", f"{self.directory}/model.toml"))
 
 
 @dataclass(frozen=True, slots=True)
