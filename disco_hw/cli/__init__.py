@@ -100,4 +100,7 @@ def app() -> typer.Typer:
     gathered.command("import")(logs.import_log)
     gathered.add_typer(logs.log_app, name="log")
     gathered.callback()(options.disco_hw)
+    for group in (gathered, virtual.experiment_app, robot.bridge_app, logs.log_app):
+        for command in group.registered_commands:
+            command.cls = options.Verb
     return gathered

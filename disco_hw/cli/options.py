@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,8 +10,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from click import Context
+from typer.core import TyperCommand
 
 from disco_hw.config import LINK_FORMS
+from disco_hw.errors import InputError
 from disco_hw.reports import as_json as json_of
 
 RobotFile = Annotated[Path, typer.Argument(metavar="ROBOT.toml", help="The robot's configuration (docs/robot.md).")]
@@ -23,6 +27,20 @@ LogFileOption = Annotated[Path | None, typer.Option("--log", help="Record to thi
 Logs = Annotated[list[Path], typer.Argument(metavar="LOG...", help="Logs of driving: MCAP or CSV.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object for machines.")]
 View = Annotated[bool, typer.Option("--view", help="Also serve the page, for this host only.")]
+
+
+class Verb(TyperCommand):
+    """A verb, of which no option takes a number that is not finite, as no limit catches nan; a default may be inf."""
+
+    def parse_args(self, ctx: Context, args: list[str]) -> list[str]:
+        """Read the arguments as the library does; raises InputError for nan, and for inf where it is no default."""
+        left = super().parse_args(ctx, args)
+        for option in self.params:
+            value = ctx.params.get(option.name or "")
+            for number in value if isinstance(value, tuple) else (value,):
+                if isinstance(number, float) and not math.isfinite(number) and number != option.default:
+                    raise InputError(f"{option.opts[0]} {number}: not a finite number; write one")
+        return left
 
 
 def progress_line(text: str) -> None:

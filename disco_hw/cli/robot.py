@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -174,12 +175,12 @@ def init(
     written = run_init(options, input if is_interactive else None, progress_line)
     from disco_hw.first_use.fence_drive import OFFER, record_fence
 
-    print(f"written: {written}\nnext: disco-hw check {written}", flush=True)
+    print(f"written: {written}\nnext: disco-hw check {shlex.quote(str(written))}", flush=True)
     # Its wiring is not known to be right yet.
     if not is_interactive or not record_fence(
         written, input, "push it, disarmed; drive it after `commission` only", link
     ):
-        print(OFFER.format(robot=written))
+        print(OFFER.format(robot=shlex.quote(str(written))))
 
 
 def commission(
@@ -208,7 +209,7 @@ def commission(
     result = run_commission(options)
     print_result(result.as_dict(), as_json, result.as_text())
     if result.ok and not as_json and not record_fence(robot, input, "push it, or drive it by hand", link):
-        print(OFFER.format(robot=robot))
+        print(OFFER.format(robot=shlex.quote(str(robot))))
     if not result.ok:
         raise typer.Exit(1)
 

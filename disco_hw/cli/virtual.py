@@ -182,9 +182,6 @@ def circle(
 
     if mode not in {"default", "sampled", "paper"}:
         raise InputError(f"--mode {mode}: no such mode; write default, sampled or paper")
-    for option, value in (("duration-s", duration_s), ("lag-s", lag_s), ("wheel-noise", wheel_noise)):
-        if not math.isfinite(value):
-            raise InputError(f"--{option} {value}: not a finite number; write one")
     refuse_directory(out)
     setup = load_setup(robot or SHIPPED_ROBOT)
     options = CircleOptions(

@@ -51,6 +51,7 @@ __all__ = [
     "link_of",
     "load_daemon_address",
     "load_robot_config",
+    "model_file_of",
     "names_address",
     "refuse_outside_task",
     "task_fault",
@@ -58,6 +59,13 @@ __all__ = [
 
 SHIPPED_ROBOT = Path(__file__).parents[1] / "robots" / "wombot.toml"
 """The robot.toml that comes with the package; its model and a path lie beside it."""
+
+
+def model_file_of(robot: Path, config: RobotConfig, model: Path | None) -> Path | None:
+    """Return the model file in use: `model` where it is given, else the one that robot.toml names, if any."""
+    if model is None and config.model.file is not None:
+        return robot.parent / config.model.file
+    return model
 
 
 def check_named_files(robot: Path | None = None, model: Path | None = None, logs: Iterable[Path] = ()) -> None:
@@ -70,8 +78,7 @@ def check_named_files(robot: Path | None = None, model: Path | None = None, logs
         config = load_robot_config(robot)
         if config.task.file is not None:
             os.close(open_file(robot.parent / config.task.file, WAY_POINTS))
-        if model is None and config.model.file is not None:
-            model = robot.parent / config.model.file
+        model = model_file_of(robot, config, model)
     if model is not None:
         read_toml(model, MODEL_TOML)
     for log in logs:

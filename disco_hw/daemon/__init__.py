@@ -11,6 +11,7 @@ import json
 import math
 import os
 import re
+import shlex
 import socket
 import struct
 import sys
@@ -256,7 +257,7 @@ def ask(robot: Path, action: str, changes: Sequence[str] = (), unrecorded: bool 
     except (InputError, WorkError) as error:
         if action != "estop":
             raise
-        hint = f"use `disco-hw estop {robot}` or the robot's own e-stop button, now"
+        hint = f"use `disco-hw estop {shlex.quote(str(robot))}` or the robot's own e-stop button, now"
         raise type(error)(f"NOT SENT: {hint} ({error})") from None
 
 

@@ -11,6 +11,7 @@ import json
 import math
 import multiprocessing
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -161,7 +162,8 @@ def serve(
             log = log_file or (new_log(config) if config.log.enabled else None)
             recorder = WatchedRecorder(_create_recorder(setup, log), feed, ticks)
             if advice_style is not None and log is not None:
-                stop.add("log", lambda: report("log", f"look at it: disco-hw view {log}, or disco-hw log info {log}"))
+                name = shlex.quote(str(log))
+                stop.add("log", lambda: report("log", f"look at it: disco-hw view {name}, or disco-hw log info {name}"))
             stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
             adaptation = create_fast_adaptation(setup, pipeline) if adapts else None
             for step in processes.enter_real_time(config.daemon.realtime_priority):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 import signal
 import socket
 import tempfile
@@ -144,11 +145,12 @@ def what_next(options: DemoOptions, log: Path, picture_file: Path) -> list[str]:
         if options.view
         else ["  disco-hw demo --view           the same, with the page in your browser while it drives"]
     )
+    named = shlex.quote(str(log))
     return [
         f"look at {picture_file}: the circle, what was driven, what was estimated",
         "type next:",
-        f"  disco-hw view {log}    the drive again, on the page, with a bar to scrub",
-        f"  disco-hw replay {log}  the controller again on the recorded inputs, bit for bit",
+        f"  disco-hw view {named}    the drive again, on the page, with a bar to scrub",
+        f"  disco-hw replay {named}  the controller again on the recorded inputs, bit for bit",
         *again,
         "  disco-hw experiment gap        an effect hidden in the robot, found, named, and driven again with",
         "  disco-hw init                  a robot.toml for a robot of your own",

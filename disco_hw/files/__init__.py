@@ -155,7 +155,8 @@ def parse_toml(content: bytes, name: str) -> dict[str, Any]:
     words, numbers among them, over 64 characters, strings over 4096, keys of more than 8 parts.
     """
     try:
-        text = content.decode("utf-8").replace("\r\n", "\n")
+        # Some editors write a mark before the first line.
+        text = content.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: not valid TOML (not UTF-8: {error.reason}); save it as UTF-8") from None
     _refuse_hostile(text, name)

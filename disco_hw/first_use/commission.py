@@ -180,7 +180,7 @@ def write_fields(
     old, _ = read_bytes(options.robot, ROBOT_TOML)
     trial = options.robot.with_name(f".{options.robot.name}.new")
     try:
-        trial.write_text(with_fields(old.decode(), edits), encoding="utf-8")
+        trial.write_text(with_fields(old.decode("utf-8-sig"), edits), encoding="utf-8")
         load_robot_config(trial)
         options.robot.with_name(f"{options.robot.name}.before").write_bytes(old)
         trial.replace(options.robot)

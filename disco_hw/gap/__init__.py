@@ -7,20 +7,22 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.config import load_robot_config
+from disco_hw.config import Robot, load_robot_config, model_file_of
 from disco_hw.errors import LogError, WorkError
 from disco_hw.gap.data import BASE_COUNT, BODY, DELAYED_BY, WHEEL, Layout
 from disco_hw.gap.data.gridded_drive import grid_drive
-from disco_hw.gap.report import FleetResult, FleetRow, GapReport, Provenance, reached_horizon_s
+from disco_hw.gap.report import FleetResult, FleetRow, GapReport, Provenance, handed_out, reached_horizon_s
 from disco_hw.gap.report.amend import amended_model, at_joint_fit, carried_terms, channel_estimates, simple_model
 from disco_hw.gap.report.blind_spots import being_proved, boldest_claims, finder
 from disco_hw.gap.report.events import main_event, rare_events
@@ -110,11 +112,10 @@ def find_gap(
     kept = written[0] if written[2] is None or written[2].kept is None else written[2].kept[0]
     offered = offered_stage(gap or _of_wheels(wheels), kept.adds_to_timed, settings)
     amended, remarks = model_of(offered, model, *written)
-    remains, events = None, rare_events(analysis.channels)
+    remains, events = None, rare_events(analysis.channels, log.sources, log.begins_s)
     if gap and written[2] is not None:
-        handed_out = "written" if offered == "amended" and "written" in gap else offered
         ahead_s = reached_horizon_s(gap, settings.prediction)
-        timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out, "floor"))
+        timed, left, noise = (gap[stage][ahead_s] for stage in ("timed", handed_out(offered, gap), "floor"))
         remains = Remains.of(timed, left, noise, written[2].errors_of_body(offered))
         if remains is not None:
             remains = replace(remains, event=main_event(events, remains.channel))
@@ -317,12 +318,13 @@ def gap(
 ) -> GapResult:
     """Find what a model misses in logs and write everything to the directory `out`.
 
-    Raises InputError for files that cannot be used and for an `out` that cannot be written, or where an input would be
-    written over; WorkError if it cannot be written after all.
+    Without `model` it is the model that robot.toml names, else the nominal one. Raises InputError for files that cannot
+    be used and for an `out` that cannot be written, or where an input would be written over; WorkError if it cannot be
+    written after all.
     """
     task, loaded = _prepared(logs, robot, out, model)
     drive = loaded(list(logs))
-    return _written(task.report(drive, progress), robot, model, out, task.robot_name)
+    return _written(task.report(drive, progress), task, out)
 
 
 @dataclass(frozen=True)
@@ -330,12 +332,18 @@ class _Task:
     """Inputs that the searches of all logs of one robot share."""
 
     model: Model
-    top_rad_s: float
-    robot_name: str
+    robot: Robot
+    robot_file: Path
+    model_file: Path | None
+
+    def inputs(self, logs: Sequence[Path]) -> list[Path]:
+        """Return all files that are read, which no report may be written over."""
+        return [*logs, self.robot_file, *([] if self.model_file is None else [self.model_file])]
 
     def report(self, drive: DriveLog, progress: Progress | None = None) -> GapReport:
         """Return the report on a drive, with pictures and proofs."""
-        return find_gap(drive, self.model, progress, pictures=True, prove=True, top_rad_s=self.top_rad_s)
+        top_rad_s = self.robot.max_wheel_speed_rad_s
+        return find_gap(drive, self.model, progress, pictures=True, prove=True, top_rad_s=top_rad_s)
 
 
 def _searched(task: _Task, drive: DriveLog) -> GapReport | str:
@@ -350,20 +358,23 @@ def _prepared(
     logs: Sequence[Path], robot: Path, out: Path, model: Path | None, names: Sequence[str] = WRITTEN
 ) -> tuple[_Task, Callable[[list[Path]], DriveLog]]:
     """Return the task of searching a robot's logs, and their loader; refuse files that cannot be read or written."""
-    refuse_directory(out, names, [*logs, robot, *([model] if model is not None else [])])
-    config = load_robot_config(robot).robot
-    start = load_model(model) if model is not None else Model.nominal(config)
+    config = load_robot_config(robot)
+    model_file = model_file_of(robot, config, model)
+    start = Model.nominal(config.robot) if model_file is None else load_model(model_file)
+    task = _Task(start, config.robot, robot, model_file)
+    refuse_directory(out, names, task.inputs(logs))
 
     def loaded(paths: list[Path]) -> DriveLog:
-        return load_drive(paths, config.ticks_per_rev, config.wheel_radius_m)
+        return load_drive(paths, config.robot.ticks_per_rev, config.robot.wheel_radius_m)
 
-    return _Task(start, config.max_wheel_speed_rad_s, config.name), loaded
+    return task, loaded
 
 
-def _written(report: GapReport, robot: Path, model: Path | None, out: Path, robot_name: str) -> GapResult:
+def _written(report: GapReport, task: _Task, out: Path) -> GapResult:
     made = datetime.now().astimezone().isoformat(timespec="minutes")
-    given = None if model is None else str(model)
-    report = replace(report, provenance=Provenance(robot_name, str(robot), given, made, version(), str(out)))
+    given = None if task.model_file is None else str(task.model_file)
+    of = Provenance(task.robot.name, str(task.robot_file), given, made, version(), str(out))
+    report = replace(report, provenance=of)
     try:
         out.mkdir(parents=True, exist_ok=True)
         (out / "report.json").write_text(as_json(report.as_dict(), indent=1), encoding="utf-8")
@@ -385,6 +396,17 @@ FLEET_WRITTEN = ("fleet.json", "fleet.txt")
 Spread = Callable[[Callable[[_Task, DriveLog], GapReport | str], _Task, Sequence[DriveLog]], Iterable[GapReport | str]]
 
 
+def _unique_names(stems: Sequence[str]) -> list[str]:
+    """Return a name for each stem: those that several logs have are numbered, past names that are taken."""
+    often = Counter(stems)
+    taken, names = {stem for stem in stems if often[stem] == 1}, []
+    for stem in stems:
+        numbered = (f"{stem}-{k}" for k in count(1))
+        names.append(stem if often[stem] == 1 else next(name for name in numbered if name not in taken))
+        taken.add(names[-1])
+    return names
+
+
 def gap_fleet(
     logs: Sequence[Path],
     robot: Path,
@@ -400,21 +422,16 @@ def gap_fleet(
     """
     task, loaded = _prepared(logs, robot, out, model, FLEET_WRITTEN)
     drives, report_progress = [loaded([log]) for log in logs], progress or (lambda text: None)
-    # Logs of two directories may have one name.
-    stems = [log.stem for log in logs]
-    places = [
-        out / (stem if stems.count(stem) == 1 else f"{stem}-{1 + stems[:k].count(stem)}")
-        for k, stem in enumerate(stems)
-    ]
+    places = [out / name for name in _unique_names([log.stem for log in logs])]
     for place in places:
-        refuse_directory(place, WRITTEN, logs)
+        refuse_directory(place, WRITTEN, task.inputs(logs))
     rows = []
     done = (_searched(task, drive) for drive in drives) if spread is None else spread(_searched, task, drives)
     for log, place, found in zip(logs, places, done, strict=True):
         if isinstance(found, str):
             rows.append(FleetRow(log, place, None, found))
         else:
-            rows.append(FleetRow(log, place, _written(found, robot, model, place, task.robot_name).report))
+            rows.append(FleetRow(log, place, _written(found, task, place).report))
         report_progress(f"{len(rows)} of {len(logs)}: {log}")
     result = FleetResult(tuple(rows), out)
     try:

@@ -6,6 +6,7 @@ shows it.
 
 from __future__ import annotations
 
+import shlex
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -144,10 +145,8 @@ class InferResult:
         if self.gap.why_not_checked is not None:
             lines.append(f"warning: whether an effect is missing was not checked: {self.gap.why_not_checked}")
         elif self.gap.missing or self.inference.predictive.outside_simulated:
-            logs = " ".join(map(str, self.logs))
-            lines.append(
-                f"next: disco-hw gap {logs} --robot {self.robot} -o gap    (its gap/model.toml has what is missing)"
-            )
+            words = ("disco-hw", "gap", *map(str, self.logs), "--robot", str(self.robot), "-o", "gap")
+            lines.append(f"next: {shlex.join(words)}    (its gap/model.toml has what is missing)")
         return lines
 
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from disco_hw.errors import LogError
 from disco_hw.log.contradictions import (
+    REVERSE_COUNT,
     SIDES,
     Contradiction,
     Link,
@@ -243,7 +244,7 @@ def _of_commands(
         return (
             Contradiction(
                 "encoder_reversed",
-                f"{side} {encoder} against the commands: change the sign of its ticks (link.direction)",
+                f"{side} {encoder} against the commands: {REVERSE_COUNT}",
                 ("body", "response"),
             ),
             Contradiction(
@@ -329,7 +330,7 @@ def _correction(
         # On a steady circle a reversed encoder explains no better than a geometry that no robot has.
         limit = _EXPLAINED if is_reversed and not fit.has_clear_axes else good
         if other is not None and other.is_usual and other.worst < limit:
-            hint = "set the sign of its ticks (link.direction)" if is_reversed else "check ticks_per_rev and gear there"
+            hint = REVERSE_COUNT if is_reversed else "check ticks_per_rev and gear there"
             return Contradiction(cause, f"{what}, by the poses: {hint}", ("body", "response"))
     mirrored = fit_body(windows, radius_m, axial_m, mirrored=True)
     if mirrored is not None and mirrored.worst < good:

@@ -8,6 +8,7 @@ records are found up to where the file breaks off. The content of records is par
 from __future__ import annotations
 
 import os
+import shlex
 import struct
 import zlib
 from collections import Counter
@@ -71,6 +72,10 @@ class DamagedError(Exception):
     """A record is not what it should be; the message says how."""
 
 
+class _PackingError(DamagedError):
+    """The index is sound, of messages that are packed as in no log of ours; the message says how."""
+
+
 class Message(NamedTuple):
     """One message of a chunk; times in wall ns."""
 
@@ -111,7 +116,10 @@ class Contents:
 
 
 def read_contents(fd: int, name: str) -> Contents:
-    """Read the index, or without one the whole file; raises LogError if it is no MCAP file at all."""
+    """Read the index, or without one the whole file.
+
+    Raises LogError if it is no MCAP file at all, or a sound one whose messages are packed in another way.
+    """
     size = os.fstat(fd).st_size
     if size == 0:
         raise LogError(f"{name}: empty file; nothing was recorded in it")
@@ -121,6 +129,11 @@ def read_contents(fd: int, name: str) -> Contents:
         return _indexed(fd, size)
     except DamagedError as damage:
         contents, ended = _walked(fd, size)
+        if isinstance(damage, _PackingError) and not contents.chunks:
+            raise LogError(
+                f"{name}: {damage}, which disco-hw does not read; pack it anew: `mcap compress {shlex.quote(name)} "
+                "-o NEW.mcap`"
+            ) from None
         if ended:
             contents.damage.append(f"the index at the end is unusable: {damage}")
         return contents
@@ -298,7 +311,7 @@ def _indexed(fd: int, size: int) -> Contents:
     if footer.summary_crc and zlib.crc32(summary + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamagedError("an index with a wrong checksum")
     contents = Contents(size=size, complete=True)
-    has_counts = False
+    has_counts, compressions = False, set[str]()
     for record in _records(summary):
         match record:
             case Schema():
@@ -309,6 +322,7 @@ def _indexed(fd: int, size: int) -> Contents:
                 contents.counts.update(record.channel_message_counts)
                 has_counts = True
             case ChunkIndex():
+                compressions.add(record.compression)
                 offset, length = record.chunk_start_offset + _HEAD.size, record.chunk_length - _HEAD.size
                 contents.chunks.append(ChunkRef(offset, length, record.message_start_time, record.message_end_time))
             case AttachmentIndex():
@@ -316,9 +330,18 @@ def _indexed(fd: int, size: int) -> Contents:
             case MetadataIndex():
                 content = _content(fd, record.offset + _HEAD.size, record.length - _HEAD.size)
                 contents.metadata.append(_parse(Metadata, content))
+    _refuse_useless_index(contents, has_counts, compressions)
+    return contents
+
+
+def _refuse_useless_index(contents: Contents, has_counts: bool, compressions: set[str]) -> None:
+    """Raise DamagedError for an index that leads to no messages."""
+    if "lz4" in compressions:
+        raise _PackingError("its chunks are packed with lz4")
+    if contents.counts.total() and not contents.chunks:
+        raise _PackingError("its messages are not in chunks")
     if not has_counts or not contents.chunks:
         raise DamagedError("an index without chunks")
-    return contents
 
 
 def _index_record(fd: int, contents: Contents, opcode: int, offset: int, length: int) -> None:

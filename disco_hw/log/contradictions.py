@@ -10,6 +10,11 @@ from disco_hw.log.motion_fits import STRAIGHT_ON_RAD, USUAL_RADIUS, USUAL_TURN, 
 
 Link = Literal["body", "response"]
 SIDES = ("left", "right")
+# A driver's own link.direction also turns the command round.
+REVERSE_COUNT = (
+    "change the sign of the count: in robot.toml (wheels.encoder_direction) before the next drive, or in the columns "
+    "of a CSV"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +38,7 @@ def of_axes(fit: BodyFit) -> Contradiction | None:
     if turns_against and backwards:
         return Contradiction(
             "wheels_reversed",
-            "both encoders count backwards beside the poses: set the sign of ticks (link.direction) for both sides",
+            f"both encoders count backwards beside the poses: {REVERSE_COUNT}",
         )
     if turns_against:
         off = "" if ahead else f", and the heading is {math.degrees(course):.0f} deg off the course"

@@ -9,6 +9,7 @@ supervisor repeats the request until the firmware shows it.
 from __future__ import annotations
 
 import enum
+import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -157,7 +158,7 @@ def by_button(action: str) -> str:
 
 def by_command(robot: Path) -> AdviceStyle:
     """Return a function that says how an operator requests an action in a terminal."""
-    return lambda action: f"run `disco-hw ctl {robot} {action}`"
+    return lambda action: f"run `disco-hw ctl {shlex.quote(str(robot))} {action}`"
 
 
 def connection(link: LinkState, link_error: str | None, driver: DriverState, driver_detail: str) -> str:

@@ -22,6 +22,7 @@ from disco_hw.config import (
     RobotConfig,
     link_fields,
     load_robot_config,
+    model_file_of,
     refuse_outside_task,
     task_fault,
 )
@@ -63,9 +64,7 @@ def load_setup(robot: Path, model: Path | None = None, link: str | None = None, 
     config = load_robot_config(robot)
     if link is not None:
         config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, **link_fields(link)))
-    model_file = model
-    if model_file is None and config.model.file is not None:
-        model_file = robot.parent / config.model.file
+    model_file = model_file_of(robot, config, model)
     config = msgspec.structs.replace(config, pose=_with_key_from_file(robot, config.pose))
     loaded = Model.nominal(config.robot, config.prior) if model_file is None else load_model(model_file)
     if config.task.file is None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
 from importlib import metadata
 
+import click
 import pytest
+from typer.main import get_command
 from typer.testing import CliRunner
 
 from disco_hw.cli import app, plain_stop
 from disco_hw.daemon import emergency
+from disco_hw.errors import InputError
 from tests.hil.stack import disco_here
 from tests.tables import thinned
 
@@ -64,6 +68,38 @@ def test_what_view_would_ignore_is_refused(arguments, ignored):
     code, output = disco_here("view", *arguments)
     assert code == 2
     assert ignored in output
+
+
+def number_options():
+    """Every option of every verb that takes numbers: the command, the option and how many it takes."""
+
+    def walk(command, name):
+        for one in command.params:
+            if isinstance(one.type, click.types.FloatParamType | click.types.Tuple):
+                yield pytest.param(command, one.opts[0], one.nargs, id=f"{name} {one.opts[0]}")
+        for sub_name, sub in getattr(command, "commands", {}).items():
+            yield from walk(sub, f"{name} {sub_name}".strip())
+
+    return list(walk(get_command(app()), ""))
+
+
+@pytest.mark.parametrize(("command", "option", "count"), number_options())
+def test_an_option_that_is_not_a_number_is_refused(command, option, count):
+    required = [
+        [one.opts[0], "x"] if isinstance(one, click.Option) else ["x"] for one in command.params if one.required
+    ]
+    arguments = [*(word for words in required for word in words), option, *["1.0"] * (count - 1), "nan"]
+    with pytest.raises(InputError, match=f"^{option} nan: not a finite number; write one$"):
+        command.make_context("", arguments)
+
+
+def test_an_infinite_option_is_refused_unless_it_is_the_default():
+    assert disco_here("experiment", "fence", "--seconds", "inf") == (
+        2, "disco-hw: --seconds inf: not a finite number; write one\n"
+    )  # fmt: skip
+    circle = get_command(app()).commands["experiment"].commands["circle"]
+    for arguments in ([], ["--largest-rot-s2", "inf"]):
+        assert circle.make_context("", arguments).params["largest_rot_s2"] == math.inf
 
 
 def test_wrong_usage_exits_with_2():

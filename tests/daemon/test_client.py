@@ -27,11 +27,11 @@ def test_what_is_no_request_is_not_sent(action, changes, message):
 
 @pytest.mark.parametrize("robot", ["no daemon", "no robot.toml"])
 def test_an_estop_that_reaches_nobody_says_what_does(tmp_path, robot):
-    path = tmp_path / "robot.toml"
+    path = tmp_path / "my robot.toml"
     if robot == "no daemon":
         path.write_text(SHIPPED_ROBOT.read_text() + f'[daemon]\ncontrol_socket = "{tmp_path / "none"}"\n')
     error = WorkError if robot == "no daemon" else InputError
-    with pytest.raises(error, match=r"NOT SENT: use `disco-hw estop .*button, now"):
+    with pytest.raises(error, match=rf"NOT SENT: use `disco-hw estop '{path}'` .*button, now"):
         ask(path, "estop")
     with pytest.raises((InputError, WorkError)) as other:
         ask(path, "status")

@@ -111,8 +111,9 @@ def test_what_is_in_a_file_comes_out(tmp_path):
     assert read_bytes(path, KEY)[1].st_ino == path.stat().st_ino
     assert begin_of(path, KEY, 4) == b"\xef\xbb\xbfa"
     assert list(read_lines(path, KEY)) == ["a = 1\r\n", "b = 'x'\n"]
-    path.write_bytes(b"[a]\r\nb = [1, 2.5]\r\n")
-    assert read_toml(path, ROBOT_TOML) == {"a": {"b": [1, 2.5]}}
+    for mark in (b"", b"\xef\xbb\xbf"):
+        path.write_bytes(mark + b"[a]\r\nb = [1, 2.5]\r\n")
+        assert read_toml(path, ROBOT_TOML) == {"a": {"b": [1, 2.5]}}
 
 
 @pytest.mark.parametrize("content", [b"," * (LONGEST_LINE + 1), b"a\n" + b"x" * 200_000 + b"\n"])

@@ -259,6 +259,13 @@ def test_a_fence_in_another_frame_than_that_of_the_poses_as_sent_is_not_in_force
         assert ("not in force in the stage floor" in capsys.readouterr().err) is is_said
 
 
+def test_a_robot_toml_that_an_editor_marked_as_utf_8_is_corrected(path):
+    text = path.read_text("utf-8")
+    path.write_text(text[text.index("[robot]") :], "utf-8-sig")
+    assert write_fields(CommissionOptions(path, write=True), {("robot", "name"): "other"})
+    assert load_setup(path).config.robot.name == "other"
+
+
 @pytest.mark.long
 def test_an_encoder_that_does_not_count_is_named_and_nothing_is_written(tmp_path):
     # The reference firmware notices by itself; an ODrive's simulator does not look.

@@ -17,7 +17,7 @@ from disco_hw.gap.report import STAGES, EffectFinding, FleetRow, GapReport, LowC
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.log.importing import write_log
-from disco_hw.model import Model
+from disco_hw.model import EffectSetting, Model, save_model
 from tools.gap.strange_robot import record
 from tools.joystick import joystick
 
@@ -53,6 +53,41 @@ def test_a_directory_that_cannot_be_used_is_refused_before_the_search(monkeypatc
         gap.gap([], robot, tmp_path, given)
     with pytest.raises(EnoughError):
         gap.gap([], robot, tmp_path / "gap", given)
+
+
+def robot_with_model(directory, name):
+    """A robot.toml whose model of this name has a dead band."""
+    model = replace(Model(0.06, 0.4), effects=(EffectSetting("deadband", {"width_rad_s": 0.8}),))
+    (directory / name).parent.mkdir(exist_ok=True)
+    save_model(model, directory / name)
+    robot = directory / "robot.toml"
+    robot.write_text(SHIPPED_ROBOT.read_text("utf-8").replace("wombot_model.toml", name), "utf-8")
+    return robot
+
+
+def test_the_search_starts_from_robot_toml_s_model_unless_another_is_given(monkeypatch, tmp_path):
+    handed = []
+
+    def search(_, model, *__, **___):
+        handed.append([setting.name for setting in model.effects])
+        return report_of("motor_lag", 0.02, 0.01)
+
+    monkeypatch.setattr(gap, "load_drive", lambda *_: None)
+    monkeypatch.setattr(gap, "find_gap", search)
+    robot, other = robot_with_model(tmp_path, "known.toml"), SHIPPED_ROBOT.parent / "wombot_model.toml"
+    used = [gap.gap([], robot, tmp_path / "out", model).report.provenance for model in (None, other)]
+    assert [one.model_file for one in used] == [str(tmp_path / "known.toml"), str(other)]
+    gap.gap_fleet([tmp_path / "a.csv"], robot, tmp_path / "fleet")
+    assert handed == [["deadband"], [], ["deadband"]]
+
+
+def test_robot_toml_s_model_is_not_written_over(monkeypatch, tmp_path):
+    monkeypatch.setattr(gap, "load_drive", lambda *_: None)
+    refusal = r"model\.toml: is read here and would be overwritten"
+    with pytest.raises(InputError, match=refusal):
+        gap.gap([], robot_with_model(tmp_path, "model.toml"), tmp_path)
+    with pytest.raises(InputError, match=refusal):
+        gap.gap_fleet([tmp_path / "run.csv"], robot_with_model(tmp_path, "run/model.toml"), tmp_path)
 
 
 def report_of(name, timed_m, amended_m, offered="amended"):
@@ -138,6 +173,14 @@ def test_a_fleet_s_json_has_the_numbers_and_every_log_its_report(fleet, tmp_path
     assert not (out / "short").exists()
 
 
+def test_no_two_logs_of_a_fleet_share_a_directory(monkeypatch, tmp_path):
+    monkeypatch.setattr(gap, "load_drive", lambda paths, *_: paths[0])
+    monkeypatch.setattr(gap, "find_gap", lambda *_, **__: report_of("motor_lag", 0.02, 0.01))
+    logs = [tmp_path / name for name in ("a/run.csv", "b/run.csv", "c/run-2.csv", "d/run-2-1.csv", "e/run.csv")]
+    places = [row.directory.name for row in gap.gap_fleet(logs, SHIPPED_ROBOT, tmp_path / "out").rows]
+    assert places == ["run-1", "run-3", "run-2", "run-2-1", "run-4"]
+
+
 def test_reports_of_a_fleet_are_written_over_no_log(fleet, tmp_path):
     inside = tmp_path / "out" / "drive" / "model.toml"
     inside.parent.mkdir(parents=True)
@@ -156,6 +199,14 @@ def test_a_log_of_a_fleet_without_poses_is_told_by_its_wheels():
     )  # fmt: skip
     assert row.as_dict()["judged_by"] == "wheels"
     assert row.as_dict()["held_out"]["timed"]["position_rmse_m"] == pytest.approx(0.020)
+
+
+@pytest.mark.parametrize(("offered", "shown"), [("amended", "80.0 mm 160 mrad"), ("timed", "20.0 mm 40 mrad")])
+def test_a_fleet_shows_the_errors_of_the_model_that_is_in_the_directory(offered, shown):
+    found = report_of("motor_lag", 0.020, 0.010, offered)
+    whole = replace(found, gap=found.gap | {"written": found.gap["refitted"]})
+    for judged in (whole, replace(whole, gap={}, wheels=whole.gap)):
+        assert FleetRow(Path("drive.mcap"), Path("out/drive"), judged).cells()[5] == shown
 
 
 # Each worker imports and compiles the search anew.

@@ -2,8 +2,11 @@ import base64
 import html
 import json
 import re
+import shlex
 from contextlib import nullcontext
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -202,6 +205,17 @@ def test_a_model_that_lacks_a_found_effect_is_marked_and_says_so(known, robot, t
     assert "the robot shows motor_lag, slope, which the model lacks" in report.read_text()
     assert "`disco-hw run` refuses it without --accept-missing-effects" in result.as_text()
     assert f"next: disco-hw gap {known}" in result.as_text()
+
+
+def test_the_next_step_can_be_pasted_where_paths_have_spaces():
+    check = SimpleNamespace(disagreements=(), edge=(), unexplained=0.0, outside_simulated=False)
+    logs = Path("my logs/a.csv"), Path("b.csv")
+    inference = SimpleNamespace(predictive=check)
+    result = verb.InferResult(inference, verb.GapCheck(("slope",)), logs, Path("my robot.toml"), None, 1.0)
+    command = result.warnings()[-1].removeprefix("next: ").partition("  ")[0]
+    assert shlex.split(command) == [
+        "disco-hw", "gap", "my logs/a.csv", "b.csv", "--robot", "my robot.toml", "-o", "gap"
+    ]  # fmt: skip
 
 
 def test_a_log_that_the_search_cannot_judge_gives_a_model_with_a_warning(known, robot, tmp_path):

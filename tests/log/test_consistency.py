@@ -40,6 +40,16 @@ def test_the_cause_is_named_first_with_its_remedy(fault):
     assert "\n" not in first.message
 
 
+@pytest.mark.parametrize("fault", [name for name in FAULTS if "reversed" in name and "encoder" in name])
+def test_a_reversed_encoder_is_put_right_without_turning_its_motor_round(fault):
+    change, _, _ = FAULTS[fault]
+    first, *_ = found(change(sound()))
+    # link.direction of a driver turns command and count round together.
+    assert "(wheels.encoder_direction)" in first.message
+    assert "link." not in first.message
+    assert "the columns of a CSV" in first.message
+
+
 @thinned("drive", ["free", "rich", "random_steps", "straight", "poor", "circle"], quick=2)
 def test_a_sound_log_is_sound_also_in_another_frame_and_without_commands(drive):
     log = sound(drive)

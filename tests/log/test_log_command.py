@@ -3,6 +3,7 @@ import json
 
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from msgspec import structs
 
 from disco_hw.errors import InputError, LogError
@@ -207,6 +208,42 @@ def test_of_nothing_nothing_is_recovered_and_no_target_left_behind(source, targe
         recover_log(source, target)
     assert "\n" not in str(refused.value)
     assert not target.exists()
+
+
+def packed_otherwise(**options):
+    """A sound MCAP file of another writer."""
+    sink = io.BytesIO()
+    writer = Writer(sink, chunk_size=1000, **options)
+    writer.start()
+    channel = writer.register_channel("/other", "json", writer.register_schema("x", "jsonschema", b"{}"))
+    for k in range(100):
+        writer.add_message(channel, k, b"{}" * 20, k, k)
+    writer.finish()
+    return sink.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"compression": CompressionType.LZ4}, "its chunks are packed with lz4"),
+        ({"use_chunking": False}, "its messages are not in chunks"),
+    ],
+    ids=["lz4", "unchunked"],
+)
+def test_a_sound_log_that_is_packed_otherwise_is_not_called_empty(tmp_path, target, options, what):
+    source = tmp_path / "my log.mcap"
+    source.write_bytes(packed_otherwise(**options))
+    refusal = f"{source}: {what}, which disco-hw does not read; pack it anew: `mcap compress '{source}' -o NEW.mcap`"
+    for read in (lambda: recover_log(source, target), lambda: open_log(source)):
+        with pytest.raises(LogError) as refused:
+            read()
+        assert str(refused.value) == refusal
+    assert not target.exists()
+
+
+def test_chunks_without_their_index_are_read(source, target):
+    source.write_bytes(packed_otherwise(index_types=IndexType.NONE))
+    assert recover_log(source, target).messages == 100
 
 
 def test_a_disk_full_on_the_way_leaves_no_target_behind(source, target):

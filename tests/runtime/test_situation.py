@@ -41,6 +41,7 @@ def test_in_a_terminal_it_names_commands_in_place_of_buttons(state):
         assert "press" not in text.lower()
     latched = advice({**STATUS, "state": "FAULT", "estop": True, "fault": "STALL_LEFT"}, advice_style)
     assert latched[0].endswith("then run `disco-hw ctl robots/mine.toml reset`.")
+    assert by_command(Path("my robot.toml"))("arm") == "run `disco-hw ctl 'my robot.toml' arm`"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ This module has the report as data: verdict, effects with intervals, unnamed ter
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -29,6 +30,11 @@ def reached_horizon_s(gap: Mapping[str, Mapping[float, PredictionErrors]], setti
     errors = gap.get("timed", {})
     reached = [s for s, e in errors.items() if s <= settings.reported_horizon_s and math.isfinite(e.position_m)]
     return max(reached, default=settings.reported_horizon_s)
+
+
+def handed_out(offered: str, errors: Mapping[str, object]) -> str:
+    """Return the stage whose errors are those of model.toml: the amended model counts as it is written."""
+    return "written" if offered == "amended" and "written" in errors else offered
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +105,7 @@ class Provenance:
     @property
     def go_on(self) -> str:
         """The command that drives with the model that is handed out."""
-        return f"disco-hw run {self.robot_file} --model {self.directory}/model.toml"
+        return shlex.join(("disco-hw", "run", self.robot_file, "--model", f"{self.directory}/model.toml"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,7 +313,7 @@ class FleetRow:
             ", ".join(one.name for one in report.doubtful) or "-",
             f"{horizon_s:g} s",
             cell("timed"),
-            cell(offered),
+            cell(handed_out(offered, errors)),
             cell("floor"),
             report.offered,
         )

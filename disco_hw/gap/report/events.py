@@ -6,7 +6,7 @@ They are found in what the final fit leaves, and change no fit.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,8 @@ class RareEvent:
     """A rare event: when it began and how long it lasted (s), where, what, and how large.
 
     `kind`: late_start, blocked, slow or fast of wheels, slip or pushed of the body. `size`: measured less predicted
-    motion, in rad of a wheel, m or rad of the body. `share`: of the channel's squared mismatches.
+    motion, in rad of a wheel, m or rad of the body. `share`: of the channel's squared mismatches. `source`: the log, of
+    several that were searched together, from whose begin the time counts.
     """
 
     begin_s: float
@@ -37,16 +38,30 @@ class RareEvent:
     unit: str
     share: float
     text: str
+    source: str = ""
 
     def describe(self) -> str:
-        """Describe when the event began and what happened."""
-        return f"at {self.begin_s:.1f} s {self.text}"
+        """Describe when the event began, in which of several logs, and what happened."""
+        of = f" of {self.source}" if self.source else ""
+        return f"at {self.begin_s:.1f} s{of} {self.text}"
 
 
-def rare_events(channels: Sequence[ChannelResult]) -> tuple[RareEvent, ...]:
-    """Return the rare events of all channels by time; chance makes one in a share `event_chance` of logs."""
+def rare_events(
+    channels: Sequence[ChannelResult], sources: Sequence[str], log_begins_s: Sequence[float]
+) -> tuple[RareEvent, ...]:
+    """Return the rare events of all channels by log and time; chance makes one in a share `event_chance` of logs.
+
+    `sources` and `log_begins_s`: the logs that were put one after the other, and when each begins.
+    """
     found = [event for one in channels for event in _events_of(one, len(channels))]
-    return tuple(sorted(found, key=lambda event: event.begin_s))
+    found.sort(key=lambda event: event.begin_s)
+    if not 1 < len(sources) == len(log_begins_s):
+        return tuple(found)
+    place = np.searchsorted(log_begins_s, [event.begin_s + 0.5 * event.duration_s for event in found], side="right") - 1
+    return tuple(
+        replace(event, source=sources[k], begin_s=event.begin_s - log_begins_s[k])
+        for event, k in zip(found, place.tolist(), strict=True)
+    )
 
 
 def main_event(events: Sequence[RareEvent], channel: Channel | None) -> str | None:

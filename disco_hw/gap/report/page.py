@@ -54,7 +54,7 @@ def summary_lines(report: GapReport) -> list[str]:
         lines.append(f"How sure: with 95 % probability {'; '.join(_range(each) for each in effects)}.")
     if report.events:
         told = sorted(report.events, key=lambda event: -event.share)[:most]
-        text = "; ".join(event.describe() for event in sorted(told, key=lambda event: event.begin_s))
+        text = "; ".join(event.describe() for event in sorted(told, key=report.events.index))
         more = len(report.events) - len(told)
         lines.append(f"Rare events: {text}.{f' And {more} more, listed below.' if more else ''}")
     if report.gap or report.wheels:

@@ -7,6 +7,7 @@ import pytest
 
 from disco_hw.effects import Channel
 from disco_hw.gap import search_log
+from disco_hw.gap.report import events as events_module
 from disco_hw.gap.report.events import RareEvent, main_event, rare_events
 from disco_hw.gap.report.page import as_text, page, summary_lines
 from disco_hw.gap.report.remains import Remains
@@ -35,7 +36,7 @@ def start(seed, duration_s):
 def found(seed, duration_s, **happened):
     analysis, _ = search_log(driven(seed, duration_s, **happened), MODEL)
     names = {name for channel in analysis.channels for name in channel.names}
-    return names, rare_events(analysis.channels)
+    return names, rare_events(analysis.channels, ("eventful",), (0.0,))
 
 
 def is_told(events, begin_s, duration_s, kind, channel):
@@ -157,3 +158,24 @@ def test_the_answer_tells_three_events_in_one_line_and_counts_the_rest():
     assert "event: at 1.0 s the left wheels stood (2% of the mismatch of command_to_wheel)" in as_text(full)
     assert "<h2>Rare events</h2>" in page(full)
     assert "Rare events" not in page(plain)
+
+
+def test_of_several_logs_an_event_names_its_log_and_the_time_in_it(monkeypatch):
+    at_s = (250.0, 20.0, 99.8)
+    monkeypatch.setattr(events_module, "_events_of", lambda *_: (event_at(begin_s, 0.6) for begin_s in at_s))
+    names, begins_s = ("a.csv", "b <1>.csv", "c.csv"), (0.0, 100.0, 207.8)
+    events = rare_events([None], names, begins_s)
+    # What begins at the edge belongs where most of it is.
+    assert [(event.source, round(event.begin_s, 6)) for event in events] == [
+        ("a.csv", 20.0), ("b <1>.csv", -0.2), ("c.csv", 42.2)
+    ]  # fmt: skip
+    full = replace(report_of("motor_lag", 0.05, 0.02), events=events)
+    assert main_event(events[2:], Channel.COMMAND_TO_WHEEL) == "at 42.2 s of c.csv the left wheels stood"
+    (line,) = (line for line in summary_lines(full) if line.startswith("Rare events"))
+    assert line.startswith("Rare events: at 20.0 s of a.csv the left wheels stood; at -0.2 s of b <1>.csv the left")
+    assert "event: at 42.2 s of c.csv the left wheels stood" in as_text(full)
+    assert "of b &lt;1&gt;.csv" in page(full)
+    assert [one["source"] for one in full.as_dict()["events"]] == list(names)
+    # Whose logs begin where is not known, and one log needs no name.
+    for one_time in (rare_events([None], names, (0.0,)), rare_events([None], names[:1], (0.0,))):
+        assert [event.describe() for event in one_time][-1] == "at 250.0 s the left wheels stood"

@@ -2,6 +2,7 @@
 
 import json
 import math
+import shlex
 from dataclasses import replace
 
 import pytest
@@ -175,6 +176,11 @@ def test_the_page_says_whose_logs_when_and_by_which_version_and_how_to_go_on():
     assert "<code>disco-hw run scout.toml --model out/gap/model.toml</code>" in html
     assert made.as_dict()["provenance"]["version"] == "0.1.0+gabc"
     assert "Go on" not in page(report(0.014))
+
+
+def test_the_next_command_can_be_pasted_where_paths_have_spaces():
+    made = replace(MADE, robot_file="my robot.toml", directory="my logs/gap")
+    assert shlex.split(made.go_on) == ["disco-hw", "run", "my robot.toml", "--model", "my logs/gap/model.toml"]
 
 
 def test_the_page_defines_its_words_in_the_margin_and_folds_what_is_for_experts():
