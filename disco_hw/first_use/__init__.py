@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import re
 import time
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,8 +81,8 @@ def _table_begun(lines: Sequence[str], k: int) -> dict[str, Any] | None:
 
 def _parsed(lines: Sequence[str]) -> dict[str, Any] | None:
     try:
-        return tomllib.loads("\n".join(lines))
-    except ValueError:
+        return parse_toml("\n".join(lines).encode(), "")
+    except InputError:
         return None
 
 
