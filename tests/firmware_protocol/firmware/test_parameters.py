@@ -143,7 +143,13 @@ def sealed_record(record):
     return record
 
 
-OTHER = {"over_current": 12.5, "over_temperature": 60.0, "under_voltage": 18.0, "stop_deceleration": 7.0}
+# Of which every byte is another than zero.
+OTHER = {
+    name: struct.unpack("<f", struct.pack("<f", value))[0]
+    for name, value in {
+        "over_current": 12.3, "over_temperature": 60.1, "under_voltage": 18.7, "stop_deceleration": 7.1,
+    }.items()
+}  # fmt: skip
 
 
 def test_what_was_written_is_kept_over_a_restart_and_nothing_else():
@@ -154,8 +160,14 @@ def test_what_was_written_is_kept_over_a_restart_and_nothing_else():
     assert config.max_wheel_speed == 8.0
     assert record[0] == 1
     assert [int.from_bytes(record[at : at + 2], "little") for at in (1, 7, 13, 19)] == [1, 2, 3, 4]
-    assert struct.unpack("<f", record[3:7]) == (12.5,)
+    assert struct.unpack("<f", record[3:7]) == (OTHER["over_current"],)
     assert record[25:30] == bytes(5)
+
+
+def test_a_record_is_sealed_with_the_crc_of_what_is_before_it():
+    records = [packed(over_current=float(current)) for current in range(1, 30)]
+    assert all(record == sealed_record(record[:]) for record in records)
+    assert {record[30] & 1 for record in records} == {0, 1}
 
 
 def test_a_record_with_any_bit_turned_is_not_taken():
@@ -212,7 +224,7 @@ def test_a_record_of_fewer_parameters_is_taken():
     record[7:30] = bytes(23)
     config, is_accepted = unpacked(sealed_record(record))
     assert is_accepted
-    assert (config.over_current, config.over_temperature) == (12.5, 80.0)
+    assert (config.over_current, config.over_temperature) == (OTHER["over_current"], 80.0)
 
 
 def test_only_a_write_that_was_accepted_is_to_be_kept(bench):
