@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +45,12 @@ def drive_from_log(log: Log) -> DriveLog:
     if not (command_ns.size or wheel_ns.size or pose_ns.size):
         raise LogError(f"{log.path}: holds no command, wheel sample or pose; nothing was driven in it")
     breaks_ns = _breaks(log, wheel_ns, notes)
-    return drive_of(str(log.path), (command_ns, speeds), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, notes=notes)
+    drive = drive_of(str(log.path), (command_ns, speeds), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, notes=notes)
+    if not wheel_ns.size:
+        return drive
+    # What an import derived is in the log as it was derived.
+    angle, speed = log.metadata.angle_measured, log.metadata.speed_measured
+    return replace(drive, wheels=replace(drive.wheels, angle_measured=angle, speed_measured=speed))
 
 
 def nominal_robot(log: Log) -> dict[str, float]:

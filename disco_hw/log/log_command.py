@@ -212,8 +212,9 @@ def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[flo
     """Write a new folder with an MCAP file and metadata.yaml; return the number of messages.
 
     `start_ns`: the wall-clock time of the drive's time 0. Wheel speeds that were commanded are JointState messages, one
-    without velocities where none is in force; with `geometry`, nominal wheel radius and axial distance (m), also
-    TwistStamped. Raises LogError if the path exists or cannot be written, InputError without `rosbags`.
+    without velocities where none is in force. Those of the wheels hold what was measured. With `geometry`, nominal
+    wheel radius and axial distance (m), also TwistStamped. Raises LogError if the path exists or cannot be written,
+    InputError without `rosbags`.
     """
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415
@@ -271,8 +272,11 @@ class _Messages:
             yield t_ns, TWIST_TOPIC, self._types["geometry_msgs/msg/TwistStamped"](header, twist)
 
     def _wheels(self, drive: DriveLog) -> Iterator[_Timed]:
-        for t_s, left, right, left_speed, right_speed, _ in rows(drive.wheels):
-            yield self._joints(t_s, WHEEL_TOPIC, [left, right], [left_speed, right_speed])
+        wheels = drive.wheels
+        for t_s, left, right, left_speed, right_speed, _ in rows(wheels):
+            angles = [left, right] if wheels.angle_measured else []
+            speeds = [left_speed, right_speed] if wheels.speed_measured else []
+            yield self._joints(t_s, WHEEL_TOPIC, angles, speeds)
 
     def _poses(self, drive: DriveLog) -> Iterator[_Timed]:
         for t_s, x_m, y_m, yaw_rad, _ in rows(drive.poses):

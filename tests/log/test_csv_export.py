@@ -1,5 +1,6 @@
 import csv
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,6 +79,21 @@ def test_nothing_is_written_where_nothing_was_in_force(drive, path):
     assert silent
     assert all(row["cmd_left_rad_s"] == "" for row in silent)
     assert any(row["pose_x_m"] == "" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("flags", "ticks_per_rev", "written"),
+    [
+        ({}, TICKS, {"ticks", "rad_s"}),
+        ({"angle_measured": False}, TICKS, {"rad_s"}),
+        ({"speed_measured": False}, TICKS, {"ticks"}),
+        ({"speed_measured": False}, None, {"rad_s"}),
+    ],
+)
+def test_of_the_wheels_what_was_measured_is_written(drive, path, flags, ticks_per_rev, written):
+    write_csv(replace(drive, wheels=replace(drive.wheels, **flags)), path, ticks_per_rev)
+    names = path.read_text(encoding="utf-8").splitlines()[0].split(",")
+    assert {name.removeprefix("enc_left_") for name in names if name.startswith("enc_left")} == written
 
 
 def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, path, tmp_path):

@@ -261,8 +261,8 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
     """Write one row for each time at which anything was recorded; return the number of rows.
 
     The command cells hold the command in force, and are empty where none is; the others are empty where there is no
-    sample at that time. With `ticks_per_rev` the wheel angles are written as ticks. Raises LogError if the file exists
-    or cannot be written.
+    sample at that time. With `ticks_per_rev` measured wheel angles are written as ticks, and speeds only if they were
+    measured. Raises LogError if the file exists or cannot be written.
     """
     commands, wheels, poses = drive.commands, drive.wheels, drive.poses
     parts = (commands, wheels, poses)
@@ -276,8 +276,9 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
         per_rad = ticks_per_rev / (2.0 * math.pi)
         for name, angle_rad in zip(TICKS, (wheels.left_angle_rad, wheels.right_angle_rad), strict=True):
             table[name] = _cells(times, wheels.t_s, np.rint(angle_rad * per_rad).astype(np.int64))
-    for name, speed_rad_s in zip(SPEED, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), strict=True):
-        table[name] = _cells(times, wheels.t_s, speed_rad_s)
+    if wheels.speed_measured or TICKS[0] not in table:
+        for name, speed_rad_s in zip(SPEED, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), strict=True):
+            table[name] = _cells(times, wheels.t_s, speed_rad_s)
     for name, value in zip((*POSITION, YAW), (poses.x_m, poses.y_m, poses.yaw_rad), strict=True):
         table[name] = _cells(times, poses.t_s, value)
     try:

@@ -1,5 +1,7 @@
 """A log of ours as a bag of ROS 2, read by the stock readers and imported again."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,8 +14,8 @@ from disco_hw.errors import LogError
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
-from disco_hw.log.log_command import export_rosbag
-from tests.inference.drives import robot_config, write_log
+from disco_hw.log.log_command import export_rosbag, write_rosbag
+from tests.inference.drives import logged, robot_config, write_log
 from tests.log.importing.commands import call
 
 
@@ -32,6 +34,15 @@ def test_what_is_exported_is_imported_again(log, tmp_path):
     given = np.isfinite(back.commands.left_rad_s)
     known = np.isfinite(drive.commands.left_rad_s)
     np.testing.assert_array_equal(back.commands.left_rad_s[given], drive.commands.left_rad_s[known])
+
+
+def test_angles_that_were_derived_from_speeds_are_not_exported(tmp_path):
+    drive = logged("poor")
+    speeds_only = replace(drive, wheels=replace(drive.wheels, angle_measured=False, speed_measured=True))
+    write_rosbag(speeds_only, tmp_path / "bag", 0, None)
+    wheels = read_rosbag(tmp_path / "bag", robot_config()).wheels
+    assert (wheels.angle_measured, wheels.speed_measured) == (False, True)
+    np.testing.assert_array_equal(wheels.left_speed_rad_s, drive.wheels.left_speed_rad_s)
 
 
 def test_stock_readers_open_it(log, tmp_path):
