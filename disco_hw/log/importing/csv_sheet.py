@@ -11,6 +11,7 @@ import math
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -80,15 +81,12 @@ def read_sheet(path: Path) -> Sheet:
     twice there, a clock that goes back by over a second, or a signal of which over half cannot be read.
     """
     text = _Lines(read_lines(path, DRIVE_CSV))
-    reader = csv.reader(text)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        if not header:
-            raise LogError(f"{path}: empty file; it needs a header row and samples")
-        _check_header(path, header)
-        lines, columns, faults = _columns(header, reader, text)
-    except csv.Error as error:
-        raise LogError(f"{path}: not a CSV file ({error}); give an MCAP log or a CSV file") from None
+    rows = _rows(path, text)
+    header = [name.strip() for _, row in islice(rows, 1) for name in row]
+    if not header:
+        raise LogError(f"{path}: empty file; it needs a header row and samples")
+    _check_header(path, header)
+    lines, columns, faults = _columns(header, rows, text)
     notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, columns, faults)]
     if not lines:
         raise LogError(f"{path}: has a header but no rows; nothing was recorded in it")
@@ -113,8 +111,33 @@ class _Lines:
         return line
 
 
+def _rows(path: Path, text: _Lines) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows with their line numbers; of a last line that was cut within a quote an empty cell.
+
+    Raises LogError for a cell that does not end in its line: a stray quote would take the rows that follow for text.
+    """
+    reader = csv.reader(text, strict=True)
+    while True:
+        line, fault = reader.line_num + 1, ""
+        try:
+            row = next(reader, None)
+        except csv.Error as error:
+            row, fault = [""], str(error)
+        if row is None:
+            return
+        if reader.line_num > line:
+            fault = "a cell goes on beyond the end of the line"
+        elif not text.is_complete:
+            fault = ""
+        if fault:
+            raise LogError(
+                f"{path}: line {line}: {fault}; write each row in one line, and quotes only around whole cells"
+            )
+        yield line, row
+
+
 def _columns(
-    header: Sequence[str], rows: Iterator[list[str]], text: _Lines
+    header: Sequence[str], rows: Iterator[tuple[int, list[str]]], text: _Lines
 ) -> tuple[Sequence[int], dict[str, Array], _Faults]:
     """Return the lines of the rows, and their known columns: NaN where a cell is empty, segments numbered from 0."""
     lines, faults = array("q"), _Faults()
@@ -122,7 +145,7 @@ def _columns(
     places = [(header.index(name), name, column) for name, column in columns.items() if name not in (SEGMENT, TIME)]
     time_at, segments = header.index(TIME), columns.get(SEGMENT)
     label_at, label, number = header.index(SEGMENT) if SEGMENT in header else 0, "", 0
-    for line, row in enumerate(rows, start=2):
+    for line, row in rows:
         if not row:
             continue
         faults.lines += 1

@@ -120,6 +120,45 @@ def test_a_last_line_that_is_cut_is_left_out(tmp_path, left):
     assert "the last line is cut off and was left out" in only_note(drive)
 
 
+NOTED = (*COLUMNS, "note")
+
+
+def with_notes(notes):
+    rows = table(columns=NOTED)
+    for k, note in notes.items():
+        rows[k]["note"] = note
+    return as_text(rows)
+
+
+@pytest.mark.parametrize("notes", [{10: 'wheel of 5" "'}, {10: '"bump"', 99: '"bump, again"'}])
+def test_quotes_within_a_line_are_read(tmp_path, notes):
+    assert sizes(read(tmp_path, with_notes(notes))) == (100, 100, 100)
+
+
+@pytest.mark.parametrize(
+    ("notes", "fault"),
+    [
+        ({10: '"late start'}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump', 50: '"bump'}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump', 50: 'bump"'}, "a cell goes on beyond the end of the line"),
+        ({10: '"two\nlines"'}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump', **dict.fromkeys((50, 51, 52), "x" * 60000)}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump" again'}, "',' expected after '\"'"),
+    ],
+    ids=["open", "closed 40 rows later", "quotes 40 rows", "a text of two lines", "131072 letters", "text behind"],
+)
+def test_a_quote_that_would_swallow_rows_is_refused_with_its_line(tmp_path, notes, fault):
+    message = refusal(tmp_path, with_notes(notes))
+    assert f"log.csv: line 12: {fault}" in message
+    assert "write each row in one line, and quotes only around whole cells" in message
+
+
+def test_a_last_line_that_is_cut_within_a_quote_is_left_out(tmp_path):
+    drive = read(tmp_path, with_notes({99: '"late start'}).rstrip("\n"))
+    assert sizes(drive) == (99, 99, 99)
+    assert any("the last line is cut off and was left out" in note for note in drive.notes)
+
+
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("cut", [False, True])
