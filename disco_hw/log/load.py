@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from dataclasses import replace
@@ -54,12 +55,12 @@ def drive_from_log(log: Log) -> DriveLog:
 
 
 def nominal_robot(log: Log) -> dict[str, float]:
-    """Numbers of [robot] in the configuration kept in the log, where they are positive; empty without one."""
+    """Positive finite numbers of [robot] in the configuration kept in the log; empty without one."""
     if ROBOT_TOML not in log.attachment_names():
         return {}
     try:
         robot = parse_toml(log.attachment(ROBOT_TOML), ROBOT_TOML)["robot"]
-        return {name: value for name, value in robot.items() if isinstance(value, int | float) and value > 0}
+        return {name: value for name, value in robot.items() if isinstance(value, int | float) and 0 < value < math.inf}
     except (InputError, KeyError, AttributeError):
         return {}
 

@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from heapq import merge
 from pathlib import Path
 from typing import Any, cast
@@ -62,7 +62,10 @@ def export(path: Path, out: Path, as_json: bool) -> str:
     with open_log(path) as log:
         drive = drive_from_log(log)
         ticks_per_rev = nominal_robot(log).get("ticks_per_rev")
-        count = write_csv(drive, out, ticks_per_rev if isinstance(ticks_per_rev, int) else None)
+        count = write_csv(drive, out, ticks_per_rev)
+    if drive.wheels.angle_measured and ticks_per_rev is None:
+        note = f"{path}: the wheel angles were left out: its robot.toml does not say how many ticks a revolution has"
+        drive = replace(drive, notes=(*drive.notes, note))
     return _exported(out, "rows", count, drive, as_json)
 
 

@@ -257,7 +257,7 @@ FORMAT = LogFormat(
 )
 
 
-def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
+def write_csv(drive: DriveLog, path: Path, ticks_per_rev: float | None) -> int:
     """Write one row for each time at which anything was recorded; return the number of rows.
 
     The command cells hold the command in force, and are empty where none is; the others are empty where there is no
