@@ -38,6 +38,7 @@ from disco_hw.log.importing.csv_sheet import (
     GYRO,
     POSITION,
     SEGMENT,
+    SIGNALS,
     SPEED,
     TICKS,
     TIME,
@@ -47,8 +48,8 @@ from disco_hw.log.importing.csv_sheet import (
 )
 from disco_hw.log.importing.losses import warnings_first
 
-# Chosen: a median from row to row outside these is milliseconds or nanoseconds read as seconds.
-_LONGEST_PERIOD_S = 2.0
+# Chosen: a median from sample to sample outside these is milliseconds or nanoseconds read as seconds.
+_LONGEST_PERIOD_S = 1.0
 _SHORTEST_PERIOD_S = 1e-4
 # Chosen: of any robot's wheels; a factor of 10 or more from wrong units leaves this range, or that around the nominal
 # radius.
@@ -65,13 +66,13 @@ _LARGEST_YAW_RATE_RAD_S = 6.0
 
 
 def time_fault(t_s: Array) -> str | None:
-    """Describe the error in times that should be in seconds; None if there is none."""
+    """Describe the error in times of a signal that should be in seconds; None if there is none."""
     if t_s.size < 3:
         return None
     period_s = float(np.median(np.diff(t_s)))
     if _SHORTEST_PERIOD_S <= period_s <= _LONGEST_PERIOD_S:
         return None
-    return f"t_s: {period_s:.3g} from row to row, which does not look like seconds; write seconds"
+    return f"t_s: {period_s:.3g} from sample to sample, which does not look like seconds; write seconds"
 
 
 def yaw_fault(t_s: Array, yaw_rad: Array, segment: Index, wheels: Wheels, commands: Commands) -> str | None:
@@ -154,7 +155,9 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
         if fault is not None:
             raise LogError(f"{path}: {fault}")
 
-    refuse(time_fault(sheet.t_s))
+    # Rows of several signals may alternate, with the command in force in each: what was measured most shows the unit.
+    samples = [sheet.group(names)[1] for names in SIGNALS.values() if names != COMMAND]
+    refuse(time_fault(sheet.t_s[max(samples, key=np.count_nonzero)]))
     sheet, wheels = _wheels(sheet, ticks_per_rev, notes)
     t_s, segment = sheet.t_s, sheet.segment
     commands = _commands(sheet)

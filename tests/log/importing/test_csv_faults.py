@@ -201,6 +201,25 @@ def test_rows_of_one_time_with_other_columns_are_one_row(tmp_path, parts):
     assert f"{(len(parts) - 1) * ROWS} rows have the time of another and were joined with it" in only_note(drive)
 
 
+@pytest.mark.parametrize("each_with_the_command", [False, True])
+def test_signals_in_rows_of_their_own_are_read(tmp_path, each_with_the_command):
+    rows = split(table(), *MERGES["each signal"])
+    for k, row in enumerate(rows):
+        row["t_s"] = f"{float(row['t_s']) + 3e-5 * (k % 3):.6f}"
+        if each_with_the_command:
+            row.update(cmd_left_rad_s="2.0", cmd_right_rad_s="3.0")
+    drive = read(tmp_path, as_text(rows))
+    assert sizes(drive)[1:] == (100, 100)
+    assert np.count_nonzero(np.isfinite(drive.commands.left_rad_s)) == (300 if each_with_the_command else 100)
+
+
+@pytest.mark.parametrize("period_ms", [2, 50])
+def test_milliseconds_are_refused(tmp_path, period_ms):
+    rows = [row | {"t_s": str(period_ms * k)} for k, row in enumerate(table())]
+    message = f"t_s: {period_ms} from sample to sample, which does not look like seconds; write seconds"
+    assert message in refusal(tmp_path, as_text(rows))
+
+
 def test_a_row_that_is_there_twice_costs_nothing(tmp_path):
     rows = table()
     drive = read(tmp_path, as_text([row for row in rows for _ in range(2)]))
