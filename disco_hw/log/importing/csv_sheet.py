@@ -87,7 +87,7 @@ def read_sheet(path: Path) -> Sheet:
         raise LogError(f"{path}: empty file; it needs a header row and samples")
     _check_header(path, header)
     lines, columns, faults = _columns(header, rows, text)
-    notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, columns, faults)]
+    notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, lines, columns, faults)]
     if not lines:
         raise LogError(f"{path}: has a header but no rows; nothing was recorded in it")
     ignored = [name for name in header if name not in _KNOWN]
@@ -220,14 +220,14 @@ def _notes_on_rows(path: Path, header: Sequence[str], faults: _Faults) -> Iterat
             )  # fmt: skip
 
 
-def _notes_on_cells(path: Path, columns: dict[str, Array], faults: _Faults) -> Iterator[str]:
+def _notes_on_cells(path: Path, lines: Sequence[int], columns: dict[str, Array], faults: _Faults) -> Iterator[str]:
     """Sentences on cells that hold no finite number, by signal."""
     for signal, names in SIGNALS.items():
         bad = sorted({line: (line, name, text) for name in names for line, text in faults.cells.get(name, ())}.values())
         if bad:
             line, name, text = bad[0]
             filled = np.isfinite(np.column_stack([columns[each] for each in names if each in columns])).any(axis=1)
-            total = max(int(np.count_nonzero(filled)), len(bad))
+            total = int(np.count_nonzero(filled | np.isin(lines, [each for each, _, _ in bad])))
             yield loss_note(
                 str(path), signal, len(bad), total,
                 f"have a cell that is not a number and were left out, the first in line {line}: {name} is {text!r}",

@@ -97,6 +97,20 @@ def test_over_5_percent_of_a_signal_is_a_warning_and_over_half_an_error(tmp_path
     assert "positions: 51 of 100 have a cell that is not a number" in refusal(tmp_path, with_lost_positions(51))
 
 
+@pytest.mark.parametrize(
+    ("changed", "signal"),
+    [
+        ({"pose_yaw_rad": "lost"}, "headings"),
+        ({"pose_x_m": "lost", "pose_y_m": "lost", "pose_yaw_rad": ""}, "positions"),
+    ],
+)
+def test_samples_of_which_no_cell_can_be_read_count_among_all(tmp_path, changed, signal):
+    rows = [row | (changed if k % 100 < 36 else {}) for k, row in enumerate(table(200))]
+    for row in rows[100:150]:
+        row.update(dict.fromkeys(changed, ""))
+    assert f"{signal}: 36 of 150 have a cell that is not a number" in only_note(read(tmp_path, as_text(rows)))
+
+
 def test_rows_of_another_width_or_without_a_time_are_left_out(tmp_path):
     lines = as_text(table()).splitlines()
     lines[10] += ",7"
