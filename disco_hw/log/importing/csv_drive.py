@@ -30,6 +30,7 @@ from disco_hw.log.drive import (
     Wheels,
     differentiate_angle,
     integrate_angle,
+    with_unknown,
 )
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.counter_wrap import Mask, continuous_wheels, restarts
@@ -46,7 +47,7 @@ from disco_hw.log.importing.csv_sheet import (
     Sheet,
     read_sheet,
 )
-from disco_hw.log.importing.losses import warnings_first
+from disco_hw.log.importing.losses import share_note, warnings_first
 
 # Chosen: a median from sample to sample outside these is milliseconds or nanoseconds read as seconds.
 _LONGEST_PERIOD_S = 1.0
@@ -142,7 +143,7 @@ _MAX_RESTART_SHARE = 0.05
 def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: float | None = None) -> DriveLog:
     """Read one CSV file; `ticks_per_rev` is needed for ticks, the nominal `wheel_radius_m` only sharpens the checks.
 
-    A command holds through empty cells for half a second at most, after that it counts as unknown. Ticks that wrap are
+    A command holds through empty cells for half a second at most, see `_commands`. Ticks that wrap are
     made continuous, and where an encoder was set anew a new segment begins. A position without heading has NaN for its
     yaw. Raises LogError with one line naming file, line, column and remedy: nothing in it, missing columns, a signal of
     which over half cannot be read, a clock that goes back, ticks that wrap faster than they are read, or units that
@@ -160,7 +161,7 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
     refuse(time_fault(sheet.t_s[max(samples, key=np.count_nonzero)]))
     sheet, wheels = _wheels(sheet, ticks_per_rev, notes)
     t_s, segment = sheet.t_s, sheet.segment
-    commands = _commands(sheet)
+    commands = _commands(sheet, notes)
     position, there = sheet.group(POSITION)
     x_m, y_m = position[there].T
     yaw_rad = sheet.group((YAW,))[0][there, 0]
@@ -177,18 +178,35 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
     return DriveLog((str(path),), commands, wheels, poses, gyro, warnings_first((*sheet.notes, *notes)))
 
 
-def _commands(sheet: Sheet) -> Commands:
+def _commands(sheet: Sheet, notes: list[str]) -> Commands:
+    """Commands, with a row of NaN where from then on none is known.
+
+    A file with a command in most rows writes what is in force: over half a second of empty cells says that nothing is.
+    Where most commands have an empty cell behind them, they are written on change or in rows of their own: each counts
+    for half a second at most, as for the controllers of ROS.
+    """
     t_s = sheet.t_s
     values, given = sheet.group(COMMAND)
-    kept = given.copy()
     rows = np.flatnonzero(given)
-    before = np.concatenate([np.zeros(1, dtype=bool), given[:-1]])
-    for start in np.flatnonzero(~given & (before | (np.arange(t_s.size) == 0))):
-        following = int(np.searchsorted(rows, start))
-        holds = start > 0 and following < rows.size and t_s[rows[following]] - t_s[start - 1] <= LONGEST_COMMAND_S
-        # One row of NaN says that from here on no command is known.
-        kept[start] = not holds
-    return Commands(t_s[kept], values[kept, 0], values[kept, 1], sheet.segment[kept])
+    next_s = np.append(t_s[rows], np.inf)[1:]
+    ends = np.append(~given[1:], False)[rows]
+    expires = ends & (next_s - t_s[rows] > LONGEST_COMMAND_S)
+    if 2 * np.count_nonzero(ends) > rows.size:
+        end_s = t_s[rows[expires]] + LONGEST_COMMAND_S
+        unknown_s = float(np.maximum(np.minimum(next_s[expires], t_s[-1]) - end_s, 0.0).sum())
+        of_s = float(t_s[-1] - t_s[rows[0]])
+        if unknown_s > 0.0:
+            text = (
+                f"{sheet.name}: commands: most have an empty cell behind them and count for {LONGEST_COMMAND_S:g} s at "
+                f"most; write the one in force into every row, as none is known for {unknown_s:.1f} of {of_s:.1f} s"
+            )
+            notes.append(share_note(text, unknown_s / of_s))
+    else:
+        end_s = t_s[rows[expires] + 1]
+    unknown_from_s = np.concatenate([t_s[:1][~given[:1]], end_s[end_s <= t_s[-1]]])
+    times_s, speeds = with_unknown(t_s[rows], values[rows], unknown_from_s)
+    segment = sheet.segment[np.searchsorted(t_s, times_s, side="right") - 1]
+    return Commands(times_s, speeds[:, 0], speeds[:, 1], segment)
 
 
 def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tuple[Sheet, Wheels]:

@@ -6,7 +6,7 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from disco_hw.log.importing.csv_drive import read_csv
+from disco_hw.log.importing.csv_drive import read_csv, write_csv
 from tests.log.refusals import refused
 
 COLUMNS = (
@@ -225,6 +225,42 @@ def test_signals_in_rows_of_their_own_are_read(tmp_path, each_with_the_command):
     drive = read(tmp_path, as_text(rows))
     assert sizes(drive)[1:] == (100, 100)
     assert np.count_nonzero(np.isfinite(drive.commands.left_rad_s)) == (300 if each_with_the_command else 100)
+
+
+def with_commands(every, count=ROWS):
+    rows = table(count)
+    for k, row in enumerate(rows):
+        if k % every:
+            row["cmd_left_rad_s"] = row["cmd_right_rad_s"] = ""
+    return as_text(rows)
+
+
+def known_commands(drive, t_s):
+    return np.isfinite(drive.commands.left_rad_s[np.searchsorted(drive.commands.t_s, t_s, side="right") - 1])
+
+
+def test_commands_that_are_written_on_change_count_for_half_a_second(tmp_path):
+    drive = read(tmp_path, with_commands(20))
+    assert drive.commands.t_s.tolist() == pytest.approx(np.arange(10) * 0.5)
+    assert np.isfinite(drive.commands.left_rad_s).tolist() == [True, False] * 5
+    assert only_note(drive).startswith("warning: ")
+    assert "none is known for 2.5 of 5.0 s (49 %)" in only_note(drive)
+    assert "write the one in force into every row" in only_note(drive)
+
+
+def test_commands_on_change_are_known_throughout_if_they_change_often(tmp_path):
+    drive = read(tmp_path, with_commands(10))
+    assert drive.commands.t_s.tolist() == pytest.approx(np.arange(10) * 0.5)
+    assert drive.notes == ()
+
+
+@pytest.mark.parametrize("every", [1, 10, 20, 60])
+def test_an_export_has_the_same_commands_at_every_time(tmp_path, every):
+    drive = read(tmp_path, with_commands(every, 200))
+    write_csv(drive, tmp_path / "export.csv", None)
+    back = read_csv(tmp_path / "export.csv")
+    between_s = drive.wheels.t_s + 0.025
+    np.testing.assert_array_equal(known_commands(back, between_s), known_commands(drive, between_s))
 
 
 @pytest.mark.parametrize("period_ms", [2, 50])
