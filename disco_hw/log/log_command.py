@@ -220,12 +220,10 @@ def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[flo
     InputError without `rosbags`.
     """
     try:
-        from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError:
         raise InputError(f"{path}: writing a bag needs rosbags; pip install 'disco-hw[ros2]'") from None
-    if path.exists():
-        raise LogError(f"{path}: already exists; give another name")
     store = get_typestore(Stores.ROS2_HUMBLE)
     messages = _Messages(store.types, max(start_ns, _EARLIEST_NS))
     count = 0
@@ -238,10 +236,14 @@ def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[flo
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(connections[topic], t_ns, store.serialize_cdr(message, kind))
                 count += 1
-    except OSError as error:
+    except WriterError:
+        raise LogError(f"{path}: already exists; give another name") from None
+    except BaseException as error:
         # Half a bag would pass for a whole one.
         shutil.rmtree(path, ignore_errors=True)
-        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        if isinstance(error, OSError):
+            raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        raise
     return count
 
 

@@ -100,9 +100,26 @@ def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, path, tmp_path):
     path.write_text("precious", encoding="utf-8")
     with pytest.raises(LogError, match="already exists"):
         write_csv(drive, path, None)
-    with pytest.raises(LogError, match="cannot be written"):
-        write_csv(drive, tmp_path / "none" / "x.csv", None)
+    for place in (tmp_path / "none" / "x.csv", path / "x.csv", tmp_path / ("x" * 300)):
+        with pytest.raises(LogError, match=r"x: cannot be written|x\.csv: cannot be written"):
+            write_csv(drive, place, None)
     assert path.read_text(encoding="utf-8") == "precious"
+
+
+def test_an_interrupted_export_leaves_no_half_table_behind(drive, path, monkeypatch):
+    class Interrupted:
+        def __init__(self, file):
+            self.writerow = csv_writer(file).writerow
+
+        def writerows(self, rows):
+            self.writerow(next(rows))
+            raise KeyboardInterrupt
+
+    csv_writer = csv.writer
+    monkeypatch.setattr(csv, "writer", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_csv(drive, path, None)
+    assert not path.exists()
 
 
 def test_a_full_disk_leaves_no_half_table_behind(drive, path):

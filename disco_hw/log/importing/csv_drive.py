@@ -303,16 +303,22 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: float | None) -> int:
     for name, value in zip((*POSITION, YAW), (poses.x_m, poses.y_m, poses.yaw_rad), strict=True):
         table[name] = _cells(times, poses.t_s, value)
     try:
-        with path.open("x", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow([TIME, *table, SEGMENT])
-            writer.writerows(zip(map(repr, times.tolist()), *table.values(), segments.tolist(), strict=True))
+        file = path.open("x", newline="", encoding="utf-8")
     except FileExistsError:
         raise LogError(f"{path}: already exists; give another name") from None
     except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+    try:
+        with file:
+            writer = csv.writer(file)
+            writer.writerow([TIME, *table, SEGMENT])
+            writer.writerows(zip(map(repr, times.tolist()), *table.values(), segments.tolist(), strict=True))
+    except BaseException as error:
         # Half a table would pass for a whole one.
         path.unlink(missing_ok=True)
-        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        if isinstance(error, OSError):
+            raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        raise
     return times.size
 
 

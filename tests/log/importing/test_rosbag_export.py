@@ -1,6 +1,7 @@
 """A log of ours as a bag of ROS 2, read by the stock readers and imported again."""
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from disco_hw.errors import LogError
+from disco_hw.log import log_command
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
@@ -62,3 +64,21 @@ def test_a_bag_is_never_overwritten(log, tmp_path):
     (tmp_path / "bag").mkdir()
     with pytest.raises(LogError, match="bag: already exists; give another name"):
         export_rosbag(log, tmp_path / "bag", as_json=False)
+
+
+def test_a_place_that_is_none_is_named(log, tmp_path):
+    for place in (log / "bag", tmp_path / ("x" * 300)):
+        with pytest.raises(LogError, match=r"(bag|xx): cannot be written \((Not a directory|File name too long)\)"):
+            export_rosbag(log, place, as_json=False)
+
+
+def test_an_interrupted_export_leaves_no_half_bag_behind(log, tmp_path, monkeypatch):
+    def interrupted(*parts, key):
+        yield from islice(merge(*parts, key=key), 20)
+        raise KeyboardInterrupt
+
+    merge = log_command.merge
+    monkeypatch.setattr(log_command, "merge", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        export_rosbag(log, tmp_path / "bag", as_json=False)
+    assert not (tmp_path / "bag").exists()
