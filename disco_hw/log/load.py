@@ -130,10 +130,11 @@ def _ordered(t_ns: NDArray[np.generic], values: Array, keep: Mask, what: str, no
 def _breaks(log: Log, wheel_ns: Index, notes: list[str]) -> Index:
     """Return times from which on a new segment counts."""
     gaps = log.gaps()
-    if gaps:
-        notes.append(f"{log.path}: {sum(gap.ticks for gap in gaps)} ticks are missing; each gap starts a new segment")
-    missing = np.asarray([gap.before_ns for gap in gaps], dtype=np.int64)
-    return np.unique(np.concatenate([after_silences(wheel_ns), missing]))
+    missing = sum(gap.ticks for gap in gaps) - len(gaps) * log.is_import
+    if missing:
+        notes.append(f"{log.path}: {missing} ticks are missing; each gap starts a new segment")
+    after_gaps = np.asarray([gap.before_ns for gap in gaps], dtype=np.int64)
+    return np.unique(np.concatenate([after_silences(wheel_ns), after_gaps]))
 
 
 def _floats(column: NDArray[np.generic]) -> Array:

@@ -118,10 +118,12 @@ def _describe_end(summary: LogSummary) -> str:
 
 def _describe(summary: LogSummary) -> str:
     size_mb = summary.bytes / 1e6
+    count = summary.segment_breaks
+    breaks = f", {count} segment break{'s' * (count != 1)}" if count else ""
     lines = [
         f"{summary.path}: {summary.robot}, {summary.duration_s:.1f} s from {summary.start}, {size_mb:.2f} MB",
         f"recorded by disco-hw {summary.version or 'of unknown version'}, part {summary.part}",
-        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {_describe_end(summary)}",
+        f"{summary.ticks} ticks, {summary.missing_ticks} missing{breaks}; {_describe_end(summary)}",
     ]
     lines += [f"continues {summary.continues}"] if summary.continues else []
     lines += [

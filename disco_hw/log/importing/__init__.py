@@ -80,7 +80,7 @@ _Timed = tuple[int, int, Record]
 def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attachment, ...] = ()) -> int:
     """Write a new log and return how many records it has; its time 0 is the drive's.
 
-    A change of segment leaves out a tick's number, as lost ticks do. Raises LogError if the file exists or cannot be
+    A change of segment leaves out one tick's number. Raises LogError if the file exists or cannot be
     written.
     """
     if drive.end_s > _LONGEST_S:
@@ -99,11 +99,12 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
             angle_measured=angle, speed_measured=speed,
         )  # fmt: skip
         log = McapLog(file, start)
-        last_ns, last_tick = 0, 0
-        for tick, (t_ns, samples) in enumerate(groupby(_samples(drive), key=lambda sample: sample[0])):
+        last_ns, last_tick, last_segment = 0, 0, 0
+        for t_ns, samples in groupby(_samples(drive), key=lambda sample: sample[0]):
             together = list(samples)
             segment = max(sample[1] for sample in together)
-            last_ns, last_tick = t_ns, tick + segment
+            last_ns, last_tick = t_ns, last_tick + 1 + (segment != last_segment)
+            last_segment = segment
             log.write(encode(last_tick, t_ns, [record for _, _, record in together]))
         log.end(End(last_ns, last_tick, 0))
         log.finish()

@@ -5,12 +5,14 @@ import pytest
 from mcap.reader import make_reader
 
 from disco_hw.errors import LogError
-from disco_hw.log.drive import Wheels
+from disco_hw.log.drive import Commands, Wheels
 from disco_hw.log.importing import import_log, write_log
 from disco_hw.log.load import load_drive
-from disco_hw.log.log_command import export
+from disco_hw.log.log_command import export, info, recover_log
+from disco_hw.log.reader import open_log
 from tests.inference.drives import TICKS_PER_REV, logged
 from tests.log.processes import files_of_at_most
+from tools.log_samples import with_damaged_chunk
 
 
 def parts(drive):
@@ -46,6 +48,27 @@ def test_what_is_written_is_read_back(path):
             assert read == pytest.approx(written - first_s, abs=2e-9), name
         else:
             assert np.array_equal(read, written, equal_nan=True), name
+
+
+def test_a_change_of_segment_is_no_loss(path):
+    drive = in_two_segments(logged("poor"))
+    later = replace(drive.poses, segment=7 * drive.poses.segment)
+    count = write_log(replace(drive, commands=Commands(), wheels=Wheels(), poses=later), path, "test")
+    assert f"{count} ticks, 0 missing, 1 segment break; ended properly" in info(path, as_json=False)
+    assert (load_drive(path).segments, load_drive(path).notes) == (2, ())
+
+
+def test_what_a_damaged_import_loses_is_missing(path, tmp_path):
+    write_log(in_two_segments(logged("poor")), path, "test")
+    with open_log(path) as log:
+        ticks = log.summary().ticks
+    path.write_bytes(with_damaged_chunk(path.read_bytes()))
+    recover_log(path, tmp_path / "mended.mcap")
+    with open_log(tmp_path / "mended.mcap") as log:
+        left = log.summary()
+    assert left.missing_ticks == pytest.approx(ticks - left.ticks, abs=1)
+    assert left.missing_ticks > 10
+    assert f"{left.missing_ticks} ticks are missing" in load_drive(tmp_path / "mended.mcap").notes[0]
 
 
 @pytest.mark.parametrize("measured", [(True, True), (True, False), (False, True)])
