@@ -90,7 +90,7 @@ def read_sheet(path: Path) -> Sheet:
     notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, lines, columns, faults)]
     if not lines:
         raise LogError(f"{path}: has a header but no rows; nothing was recorded in it")
-    ignored = [name for name in header if name not in _KNOWN]
+    ignored = dict.fromkeys(name or "one without a name" for name in header if name not in _KNOWN)
     if ignored:
         notes.append(f"{path}: ignored columns: {', '.join(ignored)}")
     return _in_order(path, lines, columns, notes)
@@ -112,7 +112,7 @@ class _Lines:
 
 
 def _rows(path: Path, text: _Lines) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows with their line numbers; of a last line that was cut within a quote an empty cell.
+    """Yield the rows with their line numbers; of a last line that was cut within a quote that quote alone.
 
     Raises LogError for a cell that does not end in its line: a stray quote would take the rows that follow for text.
     """
@@ -122,7 +122,7 @@ def _rows(path: Path, text: _Lines) -> Iterator[tuple[int, list[str]]]:
         try:
             row = next(reader, None)
         except csv.Error as error:
-            row, fault = [""], str(error)
+            row, fault = ['"'], str(error)
         if row is None:
             return
         if reader.line_num > line:
@@ -146,7 +146,8 @@ def _columns(
     time_at, segments = header.index(TIME), columns.get(SEGMENT)
     label_at, label, number = header.index(SEGMENT) if SEGMENT in header else 0, "", 0
     for line, row in rows:
-        if not row:
+        if not any(row):
+            # Spreadsheets write commas for the rows and columns that they hold empty.
             continue
         faults.lines += 1
         if len(row) != len(header):
@@ -189,9 +190,12 @@ def _number(text: str) -> tuple[float, bool]:
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
-    doubled = sorted({name for name in header if header.count(name) > 1})
+    doubled = sorted(name for name in _KNOWN if header.count(name) > 1)
     if doubled:
         raise LogError(f"{path}: column {doubled[0]} appears twice; keep one")
+    separator = next((each for each in ";\t|" if TIME in map(str.strip, header[0].split(each))), None)
+    if len(header) == 1 and separator is not None:
+        raise LogError(f"{path}: columns are separated by {separator!r}; separate them by commas, with decimal points")
     missing = [name for name in (TIME, *COMMAND) if name not in header]
     for group in (SPEED, TICKS, POSITION):
         if any(name in header for name in (*group, *((YAW,) if group == POSITION else ()))):

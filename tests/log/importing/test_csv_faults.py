@@ -183,6 +183,25 @@ def test_line_ends_of_windows_and_a_byte_order_mark_make_no_difference(tmp_path,
     assert len(drive.notes) == cut
 
 
+def test_empty_rows_and_columns_of_a_spreadsheet_make_no_difference(tmp_path):
+    lines = as_text(table()).splitlines()
+    with_empty = [f"{line},," for line in lines] + [",,,,,,,,,"] * 20
+    assert sizes(read(tmp_path, "\n".join(with_empty) + "\n")) == (100, 100, 100)
+    assert only_note(read_csv(tmp_path / "log.csv")).endswith("ignored columns: one without a name")
+
+
+def test_of_columns_that_are_not_read_there_may_be_several(tmp_path):
+    lines = [f"{line},{'note,note' if k == 0 else '7,8'}" for k, line in enumerate(as_text(table()).splitlines())]
+    assert only_note(read(tmp_path, "\n".join(lines) + "\n")).endswith("ignored columns: note")
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|", "; "])
+def test_another_separator_is_named(tmp_path, separator):
+    content = as_text(table()).replace(",", separator).replace(".", ",")
+    message = refusal(tmp_path, content)
+    assert f"columns are separated by {separator.strip(' ')!r}; separate them by commas, with decimal points" in message
+
+
 def test_rows_in_slight_disorder_are_sorted(tmp_path):
     rows = table()
     rows[40], rows[45] = rows[45], rows[40]
