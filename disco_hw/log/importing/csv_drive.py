@@ -247,9 +247,14 @@ def _with_new_segments(
     """Return the sheet with a new segment wherever an encoder restarts or may have wrapped."""
     inside = np.concatenate([[False], np.diff(segment) == 0])
     restart, uncertain = restarts(t_s, angles) & ~uncertain & inside, uncertain & inside
+
+    def first(which: Mask) -> str:
+        # Digits enough for seconds since 1970.
+        return f"first at t_s {sheet.begin_s + t_s[which][0]:.15g}"
+
     if np.count_nonzero(restart) > _MAX_RESTART_SHARE * t_s.size:
         raise LogError(
-            f"{sheet.name}: an encoder jumps {np.count_nonzero(restart)} times, first at t_s {t_s[restart][0]:.9g}, "
+            f"{sheet.name}: an encoder jumps {np.count_nonzero(restart)} times, {first(restart)}, "
             f"further than a wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
     for which, what in (
@@ -257,7 +262,7 @@ def _with_new_segments(
         (uncertain, "ticks are missing for so long that they may have wrapped unseen,"),
     ):
         if which.any():
-            times = f"{np.count_nonzero(which)} times, first at t_s {t_s[which][0]:.9g}"
+            times = f"{np.count_nonzero(which)} times, {first(which)}"
             notes.append(f"{sheet.name}: {what} {times}; new segments begin there")
     breaks_s = t_s[restart | uncertain]
     return replace(sheet, segment=sheet.segment + np.searchsorted(breaks_s, sheet.t_s, side="right"))

@@ -47,9 +47,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Columns of a CSV file: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample."""
+    """Columns of a CSV file: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample.
+
+    `begin_s`: the first time as it stands in the file.
+    """
 
     name: str
+    begin_s: float
     t_s: Array
     segment: Index
     cells: dict[str, Array]
@@ -247,8 +251,9 @@ def _in_order(path: Path, lines: Sequence[int], columns: dict[str, Array], notes
         far = backwards[np.maximum.accumulate(t_s)[backwards] - t_s[backwards + 1] > LARGEST_DISORDER_S]
         if far.size:
             at = int(far[0])
+            before_s, after_s = t_s[at : at + 2]
             raise LogError(
-                f"{path}: line {lines[at + 1]}: the clock goes backwards (t_s {t_s[at]:.9g}, then {t_s[at + 1]:.9g}); "
+                f"{path}: line {lines[at + 1]}: the clock goes backwards (t_s {before_s:.15g}, then {after_s:.15g}); "
                 "give each run as a file of its own"
             )
         notes.append(f"{path}: {backwards.size} rows came after a later one and were sorted by {TIME}")
@@ -259,7 +264,7 @@ def _in_order(path: Path, lines: Sequence[int], columns: dict[str, Array], notes
     if not first.all():
         columns = _merged(path, np.cumsum(first) - 1, columns, int(np.count_nonzero(~first)), notes)
         t_s, segment = t_s[first], segment[first]
-    return Sheet(str(path), t_s - t_s[0], segment, columns, tuple(notes))
+    return Sheet(str(path), float(t_s[0]), t_s - t_s[0], segment, columns, tuple(notes))
 
 
 def _merged(path: Path, place: Index, columns: dict[str, Array], several: int, notes: list[str]) -> dict[str, Array]:

@@ -347,6 +347,18 @@ def test_ticks_that_wrap_are_made_continuous_wheel_by_wheel(tmp_path, span, both
     assert f"enc_left_ticks wraps at {span} counts: made continuous at" in drive.notes[0]
 
 
+@pytest.mark.parametrize(("begin_s", "reset_s"), [(1000, "1007.7"), (1_700_000_000, "1700000007.7")])
+def test_a_reset_is_reported_with_the_time_of_the_file(tmp_path, begin_s, reset_s):
+    rows = with_ticks(lambda ticks: ticks if ticks < 5000 else ticks - 5000)
+    later = [row | {"t_s": f"{begin_s + float(row['t_s']):.6f}"} for row in rows]
+    assert f"an encoder was reset 1 times, first at t_s {reset_s}; new" in only_note(read_ticks(tmp_path, later))
+    back = as_text([*later, later[0]])
+    assert f"(t_s {begin_s + 19.95:.15g}, then {begin_s}); give each run" in refusal(tmp_path, back)
+    jumping = [row | {"enc_left_ticks": str((k * 7919) % 1_000_003)} for k, row in enumerate(later)]
+    message = refusal(tmp_path, as_text(jumping), ticks_per_rev=200)
+    assert f"first at t_s {begin_s}.05, further than a wheel turns" in message
+
+
 def test_an_encoder_that_is_set_anew_begins_a_new_segment(tmp_path):
     drive = read_ticks(tmp_path, with_ticks(lambda ticks: ticks if ticks < 5000 else ticks - 5000))
     assert drive.segments == 2
