@@ -74,6 +74,8 @@ class Start(msgspec.Struct, frozen=True):
     beat_s: float = 0.2
     grace_s: float = 3.0
     planner: int = 0
+    angle_measured: bool = True
+    speed_measured: bool = True
 
 
 class Started(msgspec.Struct, frozen=True, tag=True):

@@ -210,6 +210,14 @@ def drive_of(
     )
 
 
+def with_unknown(t: NDArray[Any], speeds: Array, unknown: NDArray[Any]) -> tuple[NDArray[Any], Array]:
+    """Return commands (N,), (N, 2) with a row of NaN at each time from which on none is known, in order of time."""
+    times = np.concatenate([t, unknown])
+    rows = np.concatenate([speeds, np.full((unknown.size, 2), np.nan)])
+    order = np.argsort(times, kind="stable")
+    return times[order], rows[order]
+
+
 def concatenate(drives: Sequence[DriveLog]) -> DriveLog:
     """Drives one after the other, later ones shifted in time, their segments numbered on; at least one is needed."""
     shifts_s = np.cumsum([0.0, *(drive.end_s + _BETWEEN_LOGS_S for drive in drives[:-1])])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,16 +46,21 @@ def drive_from_log(log: Log) -> DriveLog:
     if not (command_ns.size or wheel_ns.size or pose_ns.size):
         raise LogError(f"{log.path}: holds no command, wheel sample or pose; nothing was driven in it")
     breaks_ns = _breaks(log, wheel_ns, notes)
-    return drive_of(str(log.path), (command_ns, speeds), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, notes=notes)
+    drive = drive_of(str(log.path), (command_ns, speeds), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, notes=notes)
+    if not wheel_ns.size:
+        return drive
+    # What an import derived is in the log as it was derived.
+    angle, speed = log.metadata.angle_measured, log.metadata.speed_measured
+    return replace(drive, wheels=replace(drive.wheels, angle_measured=angle, speed_measured=speed))
 
 
 def nominal_robot(log: Log) -> dict[str, float]:
-    """Numbers of [robot] in the configuration kept in the log, where they are positive; empty without one."""
+    """Positive finite numbers of [robot] in the configuration kept in the log; empty without one."""
     if ROBOT_TOML not in log.attachment_names():
         return {}
     try:
         robot = parse_toml(log.attachment(ROBOT_TOML), ROBOT_TOML)["robot"]
-        return {name: value for name, value in robot.items() if isinstance(value, int | float) and value > 0}
+        return {name: value for name, value in robot.items() if isinstance(value, int | float) and 0 < value < math.inf}
     except (InputError, KeyError, AttributeError):
         return {}
 
@@ -123,10 +130,11 @@ def _ordered(t_ns: NDArray[np.generic], values: Array, keep: Mask, what: str, no
 def _breaks(log: Log, wheel_ns: Index, notes: list[str]) -> Index:
     """Return times from which on a new segment counts."""
     gaps = log.gaps()
-    if gaps:
-        notes.append(f"{log.path}: {sum(gap.ticks for gap in gaps)} ticks are missing; each gap starts a new segment")
-    missing = np.asarray([gap.before_ns for gap in gaps], dtype=np.int64)
-    return np.unique(np.concatenate([after_silences(wheel_ns), missing]))
+    missing = sum(gap.ticks for gap in gaps) - len(gaps) * log.is_import
+    if missing:
+        notes.append(f"{log.path}: {missing} ticks are missing; each gap starts a new segment")
+    after_gaps = np.asarray([gap.before_ns for gap in gaps], dtype=np.int64)
+    return np.unique(np.concatenate([after_silences(wheel_ns), after_gaps]))
 
 
 def _floats(column: NDArray[np.generic]) -> Array:

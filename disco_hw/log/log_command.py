@@ -7,7 +7,7 @@ import math
 import os
 import shutil
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from heapq import merge
 from pathlib import Path
 from typing import Any, cast
@@ -62,7 +62,10 @@ def export(path: Path, out: Path, as_json: bool) -> str:
     with open_log(path) as log:
         drive = drive_from_log(log)
         ticks_per_rev = nominal_robot(log).get("ticks_per_rev")
-        count = write_csv(drive, out, ticks_per_rev if isinstance(ticks_per_rev, int) else None)
+        count = write_csv(drive, out, ticks_per_rev)
+    if drive.wheels.angle_measured and ticks_per_rev is None:
+        note = f"{path}: the wheel angles were left out: its robot.toml does not say how many ticks a revolution has"
+        drive = replace(drive, notes=(*drive.notes, note))
     return _exported(out, "rows", count, drive, as_json)
 
 
@@ -115,10 +118,12 @@ def _describe_end(summary: LogSummary) -> str:
 
 def _describe(summary: LogSummary) -> str:
     size_mb = summary.bytes / 1e6
+    count = summary.segment_breaks
+    breaks = f", {count} segment break{'s' * (count != 1)}" if count else ""
     lines = [
         f"{summary.path}: {summary.robot}, {summary.duration_s:.1f} s from {summary.start}, {size_mb:.2f} MB",
         f"recorded by disco-hw {summary.version or 'of unknown version'}, part {summary.part}",
-        f"{summary.ticks} ticks, {summary.missing_ticks} missing; {_describe_end(summary)}",
+        f"{summary.ticks} ticks, {summary.missing_ticks} missing{breaks}; {_describe_end(summary)}",
     ]
     lines += [f"continues {summary.continues}"] if summary.continues else []
     lines += [
@@ -212,16 +217,15 @@ def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[flo
     """Write a new folder with an MCAP file and metadata.yaml; return the number of messages.
 
     `start_ns`: the wall-clock time of the drive's time 0. Wheel speeds that were commanded are JointState messages, one
-    without velocities where none is in force; with `geometry`, nominal wheel radius and axial distance (m), also
-    TwistStamped. Raises LogError if the path exists or cannot be written, InputError without `rosbags`.
+    without velocities where none is in force. Those of the wheels hold what was measured. With `geometry`, nominal
+    wheel radius and axial distance (m), also TwistStamped. Raises LogError if the path exists or cannot be written,
+    InputError without `rosbags`.
     """
     try:
-        from rosbags.rosbag2 import StoragePlugin, Writer  # noqa: PLC0415
+        from rosbags.rosbag2 import StoragePlugin, Writer, WriterError  # noqa: PLC0415
         from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
     except ImportError:
         raise InputError(f"{path}: writing a bag needs rosbags; pip install 'disco-hw[ros2]'") from None
-    if path.exists():
-        raise LogError(f"{path}: already exists; give another name")
     store = get_typestore(Stores.ROS2_HUMBLE)
     messages = _Messages(store.types, max(start_ns, _EARLIEST_NS))
     count = 0
@@ -234,10 +238,14 @@ def write_rosbag(drive: DriveLog, path: Path, start_ns: int, geometry: tuple[flo
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(connections[topic], t_ns, store.serialize_cdr(message, kind))
                 count += 1
-    except OSError as error:
+    except WriterError:
+        raise LogError(f"{path}: already exists; give another name") from None
+    except BaseException as error:
         # Half a bag would pass for a whole one.
         shutil.rmtree(path, ignore_errors=True)
-        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        if isinstance(error, OSError):
+            raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        raise
     return count
 
 
@@ -271,8 +279,11 @@ class _Messages:
             yield t_ns, TWIST_TOPIC, self._types["geometry_msgs/msg/TwistStamped"](header, twist)
 
     def _wheels(self, drive: DriveLog) -> Iterator[_Timed]:
-        for t_s, left, right, left_speed, right_speed, _ in rows(drive.wheels):
-            yield self._joints(t_s, WHEEL_TOPIC, [left, right], [left_speed, right_speed])
+        wheels = drive.wheels
+        for t_s, left, right, left_speed, right_speed, _ in rows(wheels):
+            angles = [left, right] if wheels.angle_measured else []
+            speeds = [left_speed, right_speed] if wheels.speed_measured else []
+            yield self._joints(t_s, WHEEL_TOPIC, angles, speeds)
 
     def _poses(self, drive: DriveLog) -> Iterator[_Timed]:
         for t_s, x_m, y_m, yaw_rad, _ in rows(drive.poses):

@@ -203,7 +203,8 @@ class Metadata(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
 
     `planner`: version of the planner (`control.plan.PLANNER_VERSION`); 0 where none is named, as in logs of version 1.
     A later part `continues` the file of that path, which holds ticks up to number `continues_sequence`; None if that
-    was not recorded.
+    was not recorded. `angle_measured`, `speed_measured`: False where an imported log has wheel angles, or speeds, that
+    were derived from the other.
     """
 
     format: str = ""
@@ -215,6 +216,8 @@ class Metadata(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     continues: str = ""
     continues_sequence: int | None = None
     planner: int = 0
+    angle_measured: bool = True
+    speed_measured: bool = True
 
 
 _T = TypeVar("_T")

@@ -98,7 +98,10 @@ class Entry(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """Ticks that were dropped on their way to the file: how many, and when the first one after them was."""
+    """Ticks that were dropped on their way to the file: how many, and when the first one after them was.
+
+    In an import, a change of segment leaves out a tick's number as well.
+    """
 
     before_ns: int
     ticks: int
@@ -115,7 +118,8 @@ class LogSummary(msgspec.Struct, frozen=True):
     """Contents of a log, and what is known of its end.
 
     `missing_ticks` were given to the recorder and are not in the file: between its ticks, before the first as far as
-    the former part says, and after the last where the log was ended. `ended`: the recorder ended it, at `end`; None for
+    the former part says, and after the last where the log was ended. `segment_breaks`: of an import, how often a new
+    segment begins. `ended`: the recorder ended it, at `end`; None for
     a log from before that was recorded. `complete`: its index is there. `continues`: the former part. `damage`: what of
     the file is lost.
     """
@@ -133,6 +137,7 @@ class LogSummary(msgspec.Struct, frozen=True):
     duration_s: float
     ticks: int
     missing_ticks: int
+    segment_breaks: int
     topics: dict[str, TopicSummary]
     attachments: dict[str, int]
     damage: tuple[str, ...]
@@ -186,6 +191,11 @@ class Log:
         """Description of lost data; in a recovered log, of what the recovery could not copy."""
         recovered = [record.metadata.get("lost", "") for record in self._contents.metadata if record.name == RECOVERY]
         return (*self._contents.damage, *(line for text in recovered for line in text.splitlines()))
+
+    @property
+    def is_import(self) -> bool:
+        """Whether the log was imported: of recorded ones the parts are numbered from 1 on."""
+        return self.metadata.part == 0
 
     @property
     def counts(self) -> dict[str, int]:
@@ -260,12 +270,14 @@ class Log:
 
     def summary(self) -> LogSummary:
         """Summarise the log's contents; reads the whole file once. Raises LogError for damage."""
-        ticks, missing, first, last = 0, 0, 0, 0
+        ticks, missing, breaks, first, last = 0, 0, 0, 0, 0
         for now_ns, lost in self._ticks():
             first = first if ticks else now_ns
             last = now_ns
             ticks += 1
             missing += lost
+            breaks += self.is_import and lost > 0
+        missing -= breaks
         duration_s = (last - first) * 1e-9
         # A part that continues another holds ticks from before it was begun.
         start_ns = min(self.metadata.start_ns, first) if ticks else self.metadata.start_ns
@@ -286,6 +298,7 @@ class Log:
             duration_s=duration_s,
             ticks=ticks,
             missing_ticks=missing,
+            segment_breaks=breaks,
             topics={
                 topic: TopicSummary(count, count / duration_s if duration_s > 0.0 else 0.0)
                 for topic, count in self.counts.items()

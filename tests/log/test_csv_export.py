@@ -1,5 +1,6 @@
 import csv
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,13 +81,45 @@ def test_nothing_is_written_where_nothing_was_in_force(drive, path):
     assert any(row["pose_x_m"] == "" for row in rows)
 
 
+@pytest.mark.parametrize(
+    ("flags", "ticks_per_rev", "written"),
+    [
+        ({}, TICKS, {"ticks", "rad_s"}),
+        ({"angle_measured": False}, TICKS, {"rad_s"}),
+        ({"speed_measured": False}, TICKS, {"ticks"}),
+        ({"speed_measured": False}, None, {"rad_s"}),
+    ],
+)
+def test_of_the_wheels_what_was_measured_is_written(drive, path, flags, ticks_per_rev, written):
+    write_csv(replace(drive, wheels=replace(drive.wheels, **flags)), path, ticks_per_rev)
+    names = path.read_text(encoding="utf-8").splitlines()[0].split(",")
+    assert {name.removeprefix("enc_left_") for name in names if name.startswith("enc_left")} == written
+
+
 def test_nothing_is_overwritten_and_a_bad_place_is_named(drive, path, tmp_path):
     path.write_text("precious", encoding="utf-8")
     with pytest.raises(LogError, match="already exists"):
         write_csv(drive, path, None)
-    with pytest.raises(LogError, match="cannot be written"):
-        write_csv(drive, tmp_path / "none" / "x.csv", None)
+    for place in (tmp_path / "none" / "x.csv", path / "x.csv", tmp_path / ("x" * 300)):
+        with pytest.raises(LogError, match=r"x: cannot be written|x\.csv: cannot be written"):
+            write_csv(drive, place, None)
     assert path.read_text(encoding="utf-8") == "precious"
+
+
+def test_an_interrupted_export_leaves_no_half_table_behind(drive, path, monkeypatch):
+    class Interrupted:
+        def __init__(self, file):
+            self.writerow = csv_writer(file).writerow
+
+        def writerows(self, rows):
+            self.writerow(next(rows))
+            raise KeyboardInterrupt
+
+    csv_writer = csv.writer
+    monkeypatch.setattr(csv, "writer", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_csv(drive, path, None)
+    assert not path.exists()
 
 
 def test_a_full_disk_leaves_no_half_table_behind(drive, path):

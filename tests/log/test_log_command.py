@@ -7,8 +7,9 @@ from mcap.writer import CompressionType, IndexType, Writer
 from msgspec import structs
 
 from disco_hw.errors import InputError, LogError
-from disco_hw.log import End
+from disco_hw.log import Attachment, End
 from disco_hw.log.container import MAGIC
+from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export, info, recover, recover_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Controller
@@ -112,6 +113,21 @@ def test_export_writes_the_csv(log, tmp_path):
     assert header.startswith("t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_ticks,enc_right_ticks,enc_left_rad_s")
     plain = json.loads(export(log, tmp_path / "b.csv", as_json=True))
     assert plain["rows"] == len((tmp_path / "b.csv").read_text(encoding="utf-8").splitlines()) - 1
+
+
+@pytest.mark.parametrize(
+    ("robot", "ticks_per_rev"),
+    [("ticks_per_rev = 2796.8", 2796.8), ("ticks_per_rev = 4096.0", 4096.0), ("", None), ("ticks_per_rev = inf", None)],
+)
+def test_export_writes_angles_for_any_ticks_of_a_revolution_or_says_why_not(tmp_path, robot, ticks_per_rev):
+    kept = (Attachment("robot.toml", "application/toml", f"[robot]\n{robot}\n".encode()),)
+    source = write_log(tmp_path / "run.mcap", drive_ticks(100), attachments=kept)
+    text = export(source, tmp_path / "a.csv", as_json=False)
+    assert ("run.mcap: the wheel angles were left out: its robot.toml does not say" in text) == (ticks_per_rev is None)
+    wheels = load_drive(tmp_path / "a.csv", ticks_per_rev).wheels
+    assert wheels.angle_measured == (ticks_per_rev is not None)
+    expected = load_drive(source).wheels.left_angle_rad - 0.04
+    assert wheels.left_angle_rad - wheels.left_angle_rad[0] == pytest.approx(expected, abs=0.01)
 
 
 @pytest.mark.parametrize("command", [lambda path: info(path, False), lambda path: export(path, path, False)])

@@ -35,7 +35,7 @@ def wrapped(yaw_rad):
 
 
 @pytest.mark.parametrize(
-    ("step", "fault"), [(0.02, False), (1.0, False), (20.0, True), (2e7, True), (2e-5, True)], ids=str
+    ("step", "fault"), [(0.02, False), (1.0, False), (2.0, True), (20.0, True), (2e7, True), (2e-5, True)], ids=str
 )
 def test_times_in_seconds(step, fault):
     assert (time_fault(np.arange(100) * step) is not None) == fault

@@ -1,7 +1,9 @@
 """Import of logs in foreign formats into our MCAP log, for `disco-hw import`.
 
 The formats are modules here, each with a `FORMAT`, recognised by their first bytes. A format gives the arrays of a
-drive; here they become records of the log; `drive_from_log` reads the same arrays from it again.
+drive; here they become records of the log, and its metadata says which of wheel angles and speeds were measured.
+`drive_from_log` reads the same arrays again, with one more segment after each silence of the wheels. The gyro is left
+out.
 """
 
 from __future__ import annotations
@@ -78,7 +80,7 @@ _Timed = tuple[int, int, Record]
 def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attachment, ...] = ()) -> int:
     """Write a new log and return how many records it has; its time 0 is the drive's.
 
-    A change of segment leaves out a tick's number, as lost ticks do. Raises LogError if the file exists or cannot be
+    A change of segment leaves out one tick's number. Raises LogError if the file exists or cannot be
     written.
     """
     if drive.end_s > _LONGEST_S:
@@ -91,12 +93,18 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
     except OSError as error:
         raise LogError(f"{path}: cannot be created ({error.strerror}); give another place") from None
     try:
-        log = McapLog(file, Start(str(path), robot, version(), 0, 0, part=0, attachments=attachments))
-        last_ns, last_tick = 0, 0
-        for tick, (t_ns, samples) in enumerate(groupby(_samples(drive), key=lambda sample: sample[0])):
+        angle, speed = drive.wheels.angle_measured, drive.wheels.speed_measured
+        start = Start(
+            str(path), robot, version(), 0, 0, part=0, attachments=attachments,
+            angle_measured=angle, speed_measured=speed,
+        )  # fmt: skip
+        log = McapLog(file, start)
+        last_ns, last_tick, last_segment = 0, 0, 0
+        for t_ns, samples in groupby(_samples(drive), key=lambda sample: sample[0]):
             together = list(samples)
             segment = max(sample[1] for sample in together)
-            last_ns, last_tick = t_ns, tick + segment
+            last_ns, last_tick = t_ns, last_tick + 1 + (segment != last_segment)
+            last_segment = segment
             log.write(encode(last_tick, t_ns, [record for _, _, record in together]))
         log.end(End(last_ns, last_tick, 0))
         log.finish()

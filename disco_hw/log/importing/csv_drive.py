@@ -30,6 +30,7 @@ from disco_hw.log.drive import (
     Wheels,
     differentiate_angle,
     integrate_angle,
+    with_unknown,
 )
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.counter_wrap import Mask, continuous_wheels, restarts
@@ -38,6 +39,7 @@ from disco_hw.log.importing.csv_sheet import (
     GYRO,
     POSITION,
     SEGMENT,
+    SIGNALS,
     SPEED,
     TICKS,
     TIME,
@@ -45,10 +47,10 @@ from disco_hw.log.importing.csv_sheet import (
     Sheet,
     read_sheet,
 )
-from disco_hw.log.importing.losses import warnings_first
+from disco_hw.log.importing.losses import share_note, warnings_first
 
-# Chosen: a median from row to row outside these is milliseconds or nanoseconds read as seconds.
-_LONGEST_PERIOD_S = 2.0
+# Chosen: a median from sample to sample outside these is milliseconds or nanoseconds read as seconds.
+_LONGEST_PERIOD_S = 1.0
 _SHORTEST_PERIOD_S = 1e-4
 # Chosen: of any robot's wheels; a factor of 10 or more from wrong units leaves this range, or that around the nominal
 # radius.
@@ -65,13 +67,13 @@ _LARGEST_YAW_RATE_RAD_S = 6.0
 
 
 def time_fault(t_s: Array) -> str | None:
-    """Describe the error in times that should be in seconds; None if there is none."""
+    """Describe the error in times of a signal that should be in seconds; None if there is none."""
     if t_s.size < 3:
         return None
     period_s = float(np.median(np.diff(t_s)))
     if _SHORTEST_PERIOD_S <= period_s <= _LONGEST_PERIOD_S:
         return None
-    return f"t_s: {period_s:.3g} from row to row, which does not look like seconds; write seconds"
+    return f"t_s: {period_s:.3g} from sample to sample, which does not look like seconds; write seconds"
 
 
 def yaw_fault(t_s: Array, yaw_rad: Array, segment: Index, wheels: Wheels, commands: Commands) -> str | None:
@@ -141,7 +143,7 @@ _MAX_RESTART_SHARE = 0.05
 def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: float | None = None) -> DriveLog:
     """Read one CSV file; `ticks_per_rev` is needed for ticks, the nominal `wheel_radius_m` only sharpens the checks.
 
-    A command holds through empty cells for half a second at most, after that it counts as unknown. Ticks that wrap are
+    A command holds through empty cells for half a second at most, see `_commands`. Ticks that wrap are
     made continuous, and where an encoder was set anew a new segment begins. A position without heading has NaN for its
     yaw. Raises LogError with one line naming file, line, column and remedy: nothing in it, missing columns, a signal of
     which over half cannot be read, a clock that goes back, ticks that wrap faster than they are read, or units that
@@ -154,10 +156,12 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
         if fault is not None:
             raise LogError(f"{path}: {fault}")
 
-    refuse(time_fault(sheet.t_s))
+    # Rows of several signals may alternate, with the command in force in each: what was measured most shows the unit.
+    samples = [sheet.group(names)[1] for names in SIGNALS.values() if names != COMMAND]
+    refuse(time_fault(sheet.t_s[max(samples, key=np.count_nonzero)]))
     sheet, wheels = _wheels(sheet, ticks_per_rev, notes)
     t_s, segment = sheet.t_s, sheet.segment
-    commands = _commands(sheet)
+    commands = _commands(sheet, notes)
     position, there = sheet.group(POSITION)
     x_m, y_m = position[there].T
     yaw_rad = sheet.group((YAW,))[0][there, 0]
@@ -174,18 +178,35 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
     return DriveLog((str(path),), commands, wheels, poses, gyro, warnings_first((*sheet.notes, *notes)))
 
 
-def _commands(sheet: Sheet) -> Commands:
+def _commands(sheet: Sheet, notes: list[str]) -> Commands:
+    """Commands, with a row of NaN where from then on none is known.
+
+    A file with a command in most rows writes what is in force: over half a second of empty cells says that nothing is.
+    Where most commands have an empty cell behind them, they are written on change or in rows of their own: each counts
+    for half a second at most, as for the controllers of ROS.
+    """
     t_s = sheet.t_s
     values, given = sheet.group(COMMAND)
-    kept = given.copy()
     rows = np.flatnonzero(given)
-    before = np.concatenate([np.zeros(1, dtype=bool), given[:-1]])
-    for start in np.flatnonzero(~given & (before | (np.arange(t_s.size) == 0))):
-        following = int(np.searchsorted(rows, start))
-        holds = start > 0 and following < rows.size and t_s[rows[following]] - t_s[start - 1] <= LONGEST_COMMAND_S
-        # One row of NaN says that from here on no command is known.
-        kept[start] = not holds
-    return Commands(t_s[kept], values[kept, 0], values[kept, 1], sheet.segment[kept])
+    next_s = np.append(t_s[rows], np.inf)[1:]
+    ends = np.append(~given[1:], False)[rows]
+    expires = ends & (next_s - t_s[rows] > LONGEST_COMMAND_S)
+    if 2 * np.count_nonzero(ends) > rows.size:
+        end_s = t_s[rows[expires]] + LONGEST_COMMAND_S
+        unknown_s = float(np.maximum(np.minimum(next_s[expires], t_s[-1]) - end_s, 0.0).sum())
+        of_s = float(t_s[-1] - t_s[rows[0]])
+        if unknown_s > 0.0:
+            text = (
+                f"{sheet.name}: commands: most have an empty cell behind them and count for {LONGEST_COMMAND_S:g} s at "
+                f"most; write the one in force into every row, as none is known for {unknown_s:.1f} of {of_s:.1f} s"
+            )
+            notes.append(share_note(text, unknown_s / of_s))
+    else:
+        end_s = t_s[rows[expires] + 1]
+    unknown_from_s = np.concatenate([t_s[:1][~given[:1]], end_s[end_s <= t_s[-1]]])
+    times_s, speeds = with_unknown(t_s[rows], values[rows], unknown_from_s)
+    segment = sheet.segment[np.searchsorted(t_s, times_s, side="right") - 1]
+    return Commands(times_s, speeds[:, 0], speeds[:, 1], segment)
 
 
 def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tuple[Sheet, Wheels]:
@@ -226,9 +247,14 @@ def _with_new_segments(
     """Return the sheet with a new segment wherever an encoder restarts or may have wrapped."""
     inside = np.concatenate([[False], np.diff(segment) == 0])
     restart, uncertain = restarts(t_s, angles) & ~uncertain & inside, uncertain & inside
+
+    def first(which: Mask) -> str:
+        # Digits enough for seconds since 1970.
+        return f"first at t_s {sheet.begin_s + t_s[which][0]:.15g}"
+
     if np.count_nonzero(restart) > _MAX_RESTART_SHARE * t_s.size:
         raise LogError(
-            f"{sheet.name}: an encoder jumps {np.count_nonzero(restart)} times, first at t_s {t_s[restart][0]:.9g}, "
+            f"{sheet.name}: an encoder jumps {np.count_nonzero(restart)} times, {first(restart)}, "
             f"further than a wheel turns; {TICKS[0]} and {TICKS[1]} must be cumulative, and ticks_per_rev the true one"
         )
     for which, what in (
@@ -236,7 +262,7 @@ def _with_new_segments(
         (uncertain, "ticks are missing for so long that they may have wrapped unseen,"),
     ):
         if which.any():
-            times = f"{np.count_nonzero(which)} times, first at t_s {t_s[which][0]:.9g}"
+            times = f"{np.count_nonzero(which)} times, {first(which)}"
             notes.append(f"{sheet.name}: {what} {times}; new segments begin there")
     breaks_s = t_s[restart | uncertain]
     return replace(sheet, segment=sheet.segment + np.searchsorted(breaks_s, sheet.t_s, side="right"))
@@ -257,12 +283,12 @@ FORMAT = LogFormat(
 )
 
 
-def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
+def write_csv(drive: DriveLog, path: Path, ticks_per_rev: float | None) -> int:
     """Write one row for each time at which anything was recorded; return the number of rows.
 
     The command cells hold the command in force, and are empty where none is; the others are empty where there is no
-    sample at that time. With `ticks_per_rev` the wheel angles are written as ticks. Raises LogError if the file exists
-    or cannot be written.
+    sample at that time. With `ticks_per_rev` measured wheel angles are written as ticks, and speeds only if they were
+    measured. Raises LogError if the file exists or cannot be written.
     """
     commands, wheels, poses = drive.commands, drive.wheels, drive.poses
     parts = (commands, wheels, poses)
@@ -276,21 +302,28 @@ def write_csv(drive: DriveLog, path: Path, ticks_per_rev: int | None) -> int:
         per_rad = ticks_per_rev / (2.0 * math.pi)
         for name, angle_rad in zip(TICKS, (wheels.left_angle_rad, wheels.right_angle_rad), strict=True):
             table[name] = _cells(times, wheels.t_s, np.rint(angle_rad * per_rad).astype(np.int64))
-    for name, speed_rad_s in zip(SPEED, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), strict=True):
-        table[name] = _cells(times, wheels.t_s, speed_rad_s)
+    if wheels.speed_measured or TICKS[0] not in table:
+        for name, speed_rad_s in zip(SPEED, (wheels.left_speed_rad_s, wheels.right_speed_rad_s), strict=True):
+            table[name] = _cells(times, wheels.t_s, speed_rad_s)
     for name, value in zip((*POSITION, YAW), (poses.x_m, poses.y_m, poses.yaw_rad), strict=True):
         table[name] = _cells(times, poses.t_s, value)
     try:
-        with path.open("x", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow([TIME, *table, SEGMENT])
-            writer.writerows(zip(map(repr, times.tolist()), *table.values(), segments.tolist(), strict=True))
+        file = path.open("x", newline="", encoding="utf-8")
     except FileExistsError:
         raise LogError(f"{path}: already exists; give another name") from None
     except OSError as error:
+        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+    try:
+        with file:
+            writer = csv.writer(file)
+            writer.writerow([TIME, *table, SEGMENT])
+            writer.writerows(zip(map(repr, times.tolist()), *table.values(), segments.tolist(), strict=True))
+    except BaseException as error:
         # Half a table would pass for a whole one.
         path.unlink(missing_ok=True)
-        raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        if isinstance(error, OSError):
+            raise LogError(f"{path}: cannot be written ({error.strerror}); give another place") from None
+        raise
     return times.size
 
 

@@ -11,6 +11,7 @@ import math
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -46,9 +47,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class Sheet:
-    """Columns of a CSV file: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample."""
+    """Columns of a CSV file: times (N,) from 0 on, segments (N,), and cells (N,) with NaN where there is no sample.
+
+    `begin_s`: the first time as it stands in the file.
+    """
 
     name: str
+    begin_s: float
     t_s: Array
     segment: Index
     cells: dict[str, Array]
@@ -80,19 +85,16 @@ def read_sheet(path: Path) -> Sheet:
     twice there, a clock that goes back by over a second, or a signal of which over half cannot be read.
     """
     text = _Lines(read_lines(path, DRIVE_CSV))
-    reader = csv.reader(text)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        if not header:
-            raise LogError(f"{path}: empty file; it needs a header row and samples")
-        _check_header(path, header)
-        lines, columns, faults = _columns(header, reader, text)
-    except csv.Error as error:
-        raise LogError(f"{path}: not a CSV file ({error}); give an MCAP log or a CSV file") from None
-    notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, columns, faults)]
+    rows = _rows(path, text)
+    header = [name.strip() for _, row in islice(rows, 1) for name in row]
+    if not header:
+        raise LogError(f"{path}: empty file; it needs a header row and samples")
+    _check_header(path, header)
+    lines, columns, faults = _columns(header, rows, text)
+    notes = [*_notes_on_rows(path, header, faults), *_notes_on_cells(path, lines, columns, faults)]
     if not lines:
         raise LogError(f"{path}: has a header but no rows; nothing was recorded in it")
-    ignored = [name for name in header if name not in _KNOWN]
+    ignored = dict.fromkeys(name or "one without a name" for name in header if name not in _KNOWN)
     if ignored:
         notes.append(f"{path}: ignored columns: {', '.join(ignored)}")
     return _in_order(path, lines, columns, notes)
@@ -113,8 +115,33 @@ class _Lines:
         return line
 
 
+def _rows(path: Path, text: _Lines) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows with their line numbers; of a last line that was cut within a quote that quote alone.
+
+    Raises LogError for a cell that does not end in its line: a stray quote would take the rows that follow for text.
+    """
+    reader = csv.reader(text, strict=True)
+    while True:
+        line, fault = reader.line_num + 1, ""
+        try:
+            row = next(reader, None)
+        except csv.Error as error:
+            row, fault = ['"'], str(error)
+        if row is None:
+            return
+        if reader.line_num > line:
+            fault = "a cell goes on beyond the end of the line"
+        elif not text.is_complete:
+            fault = ""
+        if fault:
+            raise LogError(
+                f"{path}: line {line}: {fault}; write each row in one line, and quotes only around whole cells"
+            )
+        yield line, row
+
+
 def _columns(
-    header: Sequence[str], rows: Iterator[list[str]], text: _Lines
+    header: Sequence[str], rows: Iterator[tuple[int, list[str]]], text: _Lines
 ) -> tuple[Sequence[int], dict[str, Array], _Faults]:
     """Return the lines of the rows, and their known columns: NaN where a cell is empty, segments numbered from 0."""
     lines, faults = array("q"), _Faults()
@@ -122,8 +149,9 @@ def _columns(
     places = [(header.index(name), name, column) for name, column in columns.items() if name not in (SEGMENT, TIME)]
     time_at, segments = header.index(TIME), columns.get(SEGMENT)
     label_at, label, number = header.index(SEGMENT) if SEGMENT in header else 0, "", 0
-    for line, row in enumerate(rows, start=2):
-        if not row:
+    for line, row in rows:
+        if not any(row):
+            # Spreadsheets write commas for the rows and columns that they hold empty.
             continue
         faults.lines += 1
         if len(row) != len(header):
@@ -166,9 +194,12 @@ def _number(text: str) -> tuple[float, bool]:
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
-    doubled = sorted({name for name in header if header.count(name) > 1})
+    doubled = sorted(name for name in _KNOWN if header.count(name) > 1)
     if doubled:
         raise LogError(f"{path}: column {doubled[0]} appears twice; keep one")
+    separator = next((each for each in ";\t|" if TIME in map(str.strip, header[0].split(each))), None)
+    if len(header) == 1 and separator is not None:
+        raise LogError(f"{path}: columns are separated by {separator!r}; separate them by commas, with decimal points")
     missing = [name for name in (TIME, *COMMAND) if name not in header]
     for group in (SPEED, TICKS, POSITION):
         if any(name in header for name in (*group, *((YAW,) if group == POSITION else ()))):
@@ -197,14 +228,14 @@ def _notes_on_rows(path: Path, header: Sequence[str], faults: _Faults) -> Iterat
             )  # fmt: skip
 
 
-def _notes_on_cells(path: Path, columns: dict[str, Array], faults: _Faults) -> Iterator[str]:
+def _notes_on_cells(path: Path, lines: Sequence[int], columns: dict[str, Array], faults: _Faults) -> Iterator[str]:
     """Sentences on cells that hold no finite number, by signal."""
     for signal, names in SIGNALS.items():
         bad = sorted({line: (line, name, text) for name in names for line, text in faults.cells.get(name, ())}.values())
         if bad:
             line, name, text = bad[0]
             filled = np.isfinite(np.column_stack([columns[each] for each in names if each in columns])).any(axis=1)
-            total = max(int(np.count_nonzero(filled)), len(bad))
+            total = int(np.count_nonzero(filled | np.isin(lines, [each for each, _, _ in bad])))
             yield loss_note(
                 str(path), signal, len(bad), total,
                 f"have a cell that is not a number and were left out, the first in line {line}: {name} is {text!r}",
@@ -220,8 +251,9 @@ def _in_order(path: Path, lines: Sequence[int], columns: dict[str, Array], notes
         far = backwards[np.maximum.accumulate(t_s)[backwards] - t_s[backwards + 1] > LARGEST_DISORDER_S]
         if far.size:
             at = int(far[0])
+            before_s, after_s = t_s[at : at + 2]
             raise LogError(
-                f"{path}: line {lines[at + 1]}: the clock goes backwards (t_s {t_s[at]:.9g}, then {t_s[at + 1]:.9g}); "
+                f"{path}: line {lines[at + 1]}: the clock goes backwards (t_s {before_s:.15g}, then {after_s:.15g}); "
                 "give each run as a file of its own"
             )
         notes.append(f"{path}: {backwards.size} rows came after a later one and were sorted by {TIME}")
@@ -232,7 +264,7 @@ def _in_order(path: Path, lines: Sequence[int], columns: dict[str, Array], notes
     if not first.all():
         columns = _merged(path, np.cumsum(first) - 1, columns, int(np.count_nonzero(~first)), notes)
         t_s, segment = t_s[first], segment[first]
-    return Sheet(str(path), t_s - t_s[0], segment, columns, tuple(notes))
+    return Sheet(str(path), float(t_s[0]), t_s - t_s[0], segment, columns, tuple(notes))
 
 
 def _merged(path: Path, place: Index, columns: dict[str, Array], several: int, notes: list[str]) -> dict[str, Array]:

@@ -26,10 +26,15 @@ def loss_note(source: str, signal: str, dropped: int, total: int, what: str, hin
     It begins with WARNING if over 5 % of the signal is lost. Raises LogError if over half of it is.
     """
     share = dropped / total
-    text = f"{signal}: {dropped} of {total} {what} ({_percent(share)})"
+    text = f"{source}: {signal}: {dropped} of {total} {what}"
     if share > REFUSED_SHARE:
-        raise LogError(f"{source}: {text}; {hint}")
-    return f"{WARNING if share > WARNED_SHARE else ''}{source}: {text}"
+        raise LogError(f"{text} ({_percent(share)}); {hint}")
+    return share_note(text, share)
+
+
+def share_note(text: str, share: float) -> str:
+    """Return the sentence with the share of a signal that it speaks of; it begins with WARNING above 5 %."""
+    return f"{WARNING if share > WARNED_SHARE else ''}{text} ({_percent(share)})"
 
 
 def warnings_first(notes: tuple[str, ...]) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from disco_hw.log.drive import (
     drive_of,
     poses,
     rotations,
+    with_unknown,
 )
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, continuous_wheels, restarts
@@ -301,10 +302,7 @@ def _expired(t_ns: Index, speeds: Array) -> tuple[Index, Array]:
     ends = t_ns + _LONGEST_COMMAND_NS
     is_expired = np.append(np.diff(t_ns) > _LONGEST_COMMAND_NS, True) if t_ns.size else np.empty(0, dtype=bool)
     is_expired &= np.isfinite(speeds).all(axis=1)
-    times = np.concatenate([t_ns, ends[is_expired]])
-    rows = np.concatenate([speeds, np.full((np.count_nonzero(is_expired), 2), np.nan)])
-    order = np.argsort(times, kind="stable")
-    return times[order], rows[order]
+    return with_unknown(t_ns, speeds, ends[is_expired])
 
 
 def _pauses(wheel_ns: Index, others: Sequence[Index]) -> Index:

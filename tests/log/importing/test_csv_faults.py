@@ -6,7 +6,7 @@ from operator import attrgetter
 import numpy as np
 import pytest
 
-from disco_hw.log.importing.csv_drive import read_csv
+from disco_hw.log.importing.csv_drive import read_csv, write_csv
 from tests.log.refusals import refused
 
 COLUMNS = (
@@ -97,6 +97,20 @@ def test_over_5_percent_of_a_signal_is_a_warning_and_over_half_an_error(tmp_path
     assert "positions: 51 of 100 have a cell that is not a number" in refusal(tmp_path, with_lost_positions(51))
 
 
+@pytest.mark.parametrize(
+    ("changed", "signal"),
+    [
+        ({"pose_yaw_rad": "lost"}, "headings"),
+        ({"pose_x_m": "lost", "pose_y_m": "lost", "pose_yaw_rad": ""}, "positions"),
+    ],
+)
+def test_samples_of_which_no_cell_can_be_read_count_among_all(tmp_path, changed, signal):
+    rows = [row | (changed if k % 100 < 36 else {}) for k, row in enumerate(table(200))]
+    for row in rows[100:150]:
+        row.update(dict.fromkeys(changed, ""))
+    assert f"{signal}: 36 of 150 have a cell that is not a number" in only_note(read(tmp_path, as_text(rows)))
+
+
 def test_rows_of_another_width_or_without_a_time_are_left_out(tmp_path):
     lines = as_text(table()).splitlines()
     lines[10] += ",7"
@@ -120,6 +134,45 @@ def test_a_last_line_that_is_cut_is_left_out(tmp_path, left):
     assert "the last line is cut off and was left out" in only_note(drive)
 
 
+NOTED = (*COLUMNS, "note")
+
+
+def with_notes(notes):
+    rows = table(columns=NOTED)
+    for k, note in notes.items():
+        rows[k]["note"] = note
+    return as_text(rows)
+
+
+@pytest.mark.parametrize("notes", [{10: 'wheel of 5" "'}, {10: '"bump"', 99: '"bump, again"'}])
+def test_quotes_within_a_line_are_read(tmp_path, notes):
+    assert sizes(read(tmp_path, with_notes(notes))) == (100, 100, 100)
+
+
+@pytest.mark.parametrize(
+    ("notes", "fault"),
+    [
+        ({10: '"late start'}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump', 50: '"bump'}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump', 50: 'bump"'}, "a cell goes on beyond the end of the line"),
+        ({10: '"two\nlines"'}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump', **dict.fromkeys((50, 51, 52), "x" * 60000)}, "a cell goes on beyond the end of the line"),
+        ({10: '"bump" again'}, "',' expected after '\"'"),
+    ],
+    ids=["open", "closed 40 rows later", "quotes 40 rows", "a text of two lines", "131072 letters", "text behind"],
+)
+def test_a_quote_that_would_swallow_rows_is_refused_with_its_line(tmp_path, notes, fault):
+    message = refusal(tmp_path, with_notes(notes))
+    assert f"log.csv: line 12: {fault}" in message
+    assert "write each row in one line, and quotes only around whole cells" in message
+
+
+def test_a_last_line_that_is_cut_within_a_quote_is_left_out(tmp_path):
+    drive = read(tmp_path, with_notes({99: '"late start'}).rstrip("\n"))
+    assert sizes(drive) == (99, 99, 99)
+    assert any("the last line is cut off and was left out" in note for note in drive.notes)
+
+
 @pytest.mark.parametrize("mark", [b"", b"\xef\xbb\xbf"])
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 @pytest.mark.parametrize("cut", [False, True])
@@ -128,6 +181,25 @@ def test_line_ends_of_windows_and_a_byte_order_mark_make_no_difference(tmp_path,
     drive = read(tmp_path, content[:-20] if cut else content)
     assert sizes(drive) == ((99, 99, 99) if cut else (100, 100, 100))
     assert len(drive.notes) == cut
+
+
+def test_empty_rows_and_columns_of_a_spreadsheet_make_no_difference(tmp_path):
+    lines = as_text(table()).splitlines()
+    with_empty = [f"{line},," for line in lines] + [",,,,,,,,,"] * 20
+    assert sizes(read(tmp_path, "\n".join(with_empty) + "\n")) == (100, 100, 100)
+    assert only_note(read_csv(tmp_path / "log.csv")).endswith("ignored columns: one without a name")
+
+
+def test_of_columns_that_are_not_read_there_may_be_several(tmp_path):
+    lines = [f"{line},{'note,note' if k == 0 else '7,8'}" for k, line in enumerate(as_text(table()).splitlines())]
+    assert only_note(read(tmp_path, "\n".join(lines) + "\n")).endswith("ignored columns: note")
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|", "; "])
+def test_another_separator_is_named(tmp_path, separator):
+    content = as_text(table()).replace(",", separator).replace(".", ",")
+    message = refusal(tmp_path, content)
+    assert f"columns are separated by {separator.strip(' ')!r}; separate them by commas, with decimal points" in message
 
 
 def test_rows_in_slight_disorder_are_sorted(tmp_path):
@@ -160,6 +232,61 @@ def test_rows_of_one_time_with_other_columns_are_one_row(tmp_path, parts):
     for name in ("commands.left_rad_s", "wheels.left_angle_rad", "poses.yaw_rad", "poses.t_s"):
         np.testing.assert_array_equal(attrgetter(name)(drive), attrgetter(name)(reference))
     assert f"{(len(parts) - 1) * ROWS} rows have the time of another and were joined with it" in only_note(drive)
+
+
+@pytest.mark.parametrize("each_with_the_command", [False, True])
+def test_signals_in_rows_of_their_own_are_read(tmp_path, each_with_the_command):
+    rows = split(table(), *MERGES["each signal"])
+    for k, row in enumerate(rows):
+        row["t_s"] = f"{float(row['t_s']) + 3e-5 * (k % 3):.6f}"
+        if each_with_the_command:
+            row.update(cmd_left_rad_s="2.0", cmd_right_rad_s="3.0")
+    drive = read(tmp_path, as_text(rows))
+    assert sizes(drive)[1:] == (100, 100)
+    assert np.count_nonzero(np.isfinite(drive.commands.left_rad_s)) == (300 if each_with_the_command else 100)
+
+
+def with_commands(every, count=ROWS):
+    rows = table(count)
+    for k, row in enumerate(rows):
+        if k % every:
+            row["cmd_left_rad_s"] = row["cmd_right_rad_s"] = ""
+    return as_text(rows)
+
+
+def known_commands(drive, t_s):
+    return np.isfinite(drive.commands.left_rad_s[np.searchsorted(drive.commands.t_s, t_s, side="right") - 1])
+
+
+def test_commands_that_are_written_on_change_count_for_half_a_second(tmp_path):
+    drive = read(tmp_path, with_commands(20))
+    assert drive.commands.t_s.tolist() == pytest.approx(np.arange(10) * 0.5)
+    assert np.isfinite(drive.commands.left_rad_s).tolist() == [True, False] * 5
+    assert only_note(drive).startswith("warning: ")
+    assert "none is known for 2.5 of 5.0 s (49 %)" in only_note(drive)
+    assert "write the one in force into every row" in only_note(drive)
+
+
+def test_commands_on_change_are_known_throughout_if_they_change_often(tmp_path):
+    drive = read(tmp_path, with_commands(10))
+    assert drive.commands.t_s.tolist() == pytest.approx(np.arange(10) * 0.5)
+    assert drive.notes == ()
+
+
+@pytest.mark.parametrize("every", [1, 10, 20, 60])
+def test_an_export_has_the_same_commands_at_every_time(tmp_path, every):
+    drive = read(tmp_path, with_commands(every, 200))
+    write_csv(drive, tmp_path / "export.csv", None)
+    back = read_csv(tmp_path / "export.csv")
+    between_s = drive.wheels.t_s + 0.025
+    np.testing.assert_array_equal(known_commands(back, between_s), known_commands(drive, between_s))
+
+
+@pytest.mark.parametrize("period_ms", [2, 50])
+def test_milliseconds_are_refused(tmp_path, period_ms):
+    rows = [row | {"t_s": str(period_ms * k)} for k, row in enumerate(table())]
+    message = f"t_s: {period_ms} from sample to sample, which does not look like seconds; write seconds"
+    assert message in refusal(tmp_path, as_text(rows))
 
 
 def test_a_row_that_is_there_twice_costs_nothing(tmp_path):
@@ -218,6 +345,18 @@ def test_ticks_that_wrap_are_made_continuous_wheel_by_wheel(tmp_path, span, both
     assert drive.segments == 1
     assert len(drive.notes) == 1 + both
     assert f"enc_left_ticks wraps at {span} counts: made continuous at" in drive.notes[0]
+
+
+@pytest.mark.parametrize(("begin_s", "reset_s"), [(1000, "1007.7"), (1_700_000_000, "1700000007.7")])
+def test_a_reset_is_reported_with_the_time_of_the_file(tmp_path, begin_s, reset_s):
+    rows = with_ticks(lambda ticks: ticks if ticks < 5000 else ticks - 5000)
+    later = [row | {"t_s": f"{begin_s + float(row['t_s']):.6f}"} for row in rows]
+    assert f"an encoder was reset 1 times, first at t_s {reset_s}; new" in only_note(read_ticks(tmp_path, later))
+    back = as_text([*later, later[0]])
+    assert f"(t_s {begin_s + 19.95:.15g}, then {begin_s}); give each run" in refusal(tmp_path, back)
+    jumping = [row | {"enc_left_ticks": str((k * 7919) % 1_000_003)} for k, row in enumerate(later)]
+    message = refusal(tmp_path, as_text(jumping), ticks_per_rev=200)
+    assert f"first at t_s {begin_s}.05, further than a wheel turns" in message
 
 
 def test_an_encoder_that_is_set_anew_begins_a_new_segment(tmp_path):

@@ -1,5 +1,8 @@
 """A log of ours as a bag of ROS 2, read by the stock readers and imported again."""
 
+from dataclasses import replace
+from itertools import islice
+
 import numpy as np
 import pytest
 
@@ -9,11 +12,12 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 
 from disco_hw.errors import LogError
+from disco_hw.log import log_command
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
-from disco_hw.log.log_command import export_rosbag
-from tests.inference.drives import robot_config, write_log
+from disco_hw.log.log_command import export_rosbag, write_rosbag
+from tests.inference.drives import logged, robot_config, write_log
 from tests.log.importing.commands import call
 
 
@@ -34,6 +38,15 @@ def test_what_is_exported_is_imported_again(log, tmp_path):
     np.testing.assert_array_equal(back.commands.left_rad_s[given], drive.commands.left_rad_s[known])
 
 
+def test_angles_that_were_derived_from_speeds_are_not_exported(tmp_path):
+    drive = logged("poor")
+    speeds_only = replace(drive, wheels=replace(drive.wheels, angle_measured=False, speed_measured=True))
+    write_rosbag(speeds_only, tmp_path / "bag", 0, None)
+    wheels = read_rosbag(tmp_path / "bag", robot_config()).wheels
+    assert (wheels.angle_measured, wheels.speed_measured) == (False, True)
+    np.testing.assert_array_equal(wheels.left_speed_rad_s, drive.wheels.left_speed_rad_s)
+
+
 def test_stock_readers_open_it(log, tmp_path):
     export_rosbag(log, tmp_path / "bag", as_json=False)
     with AnyReader([tmp_path / "bag"]) as reader:
@@ -51,3 +64,21 @@ def test_a_bag_is_never_overwritten(log, tmp_path):
     (tmp_path / "bag").mkdir()
     with pytest.raises(LogError, match="bag: already exists; give another name"):
         export_rosbag(log, tmp_path / "bag", as_json=False)
+
+
+def test_a_place_that_is_none_is_named(log, tmp_path):
+    for place in (log / "bag", tmp_path / ("x" * 300)):
+        with pytest.raises(LogError, match=r"(bag|xx): cannot be written \((Not a directory|File name too long)\)"):
+            export_rosbag(log, place, as_json=False)
+
+
+def test_an_interrupted_export_leaves_no_half_bag_behind(log, tmp_path, monkeypatch):
+    def interrupted(*parts, key):
+        yield from islice(merge(*parts, key=key), 20)
+        raise KeyboardInterrupt
+
+    merge = log_command.merge
+    monkeypatch.setattr(log_command, "merge", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        export_rosbag(log, tmp_path / "bag", as_json=False)
+    assert not (tmp_path / "bag").exists()
