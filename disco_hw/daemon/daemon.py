@@ -9,7 +9,7 @@ from typing import Any
 from disco_hw import processes
 from disco_hw.daemon import ADAPT_ACTIONS, FENCE, OBSTACLE, PAGE_ACTIONS, TASK, UNRECORDED_HINT
 from disco_hw.daemon.control_socket import ControlMessage, ControlServer, counters, loop_figures, status
-from disco_hw.daemon.loop import Clock, Loop
+from disco_hw.daemon.loop import Clock, Loop, SuspendWatch
 from disco_hw.daemon.page_feed import WatchedRecorder
 from disco_hw.daemon.process import Notifier, StopSignals, Waiting
 from disco_hw.fence.clearance import task_breach
@@ -33,6 +33,8 @@ _FAN_NS = _SECOND_NS
 _WATCHED_FAN_NS = _SECOND_NS // 2
 # Chosen: enough to see where the plans go; each costs time of the tick and space in the log.
 _FAN_PATHS = 16
+
+_SUSPENDED = "this computer was suspended: the robot is disarmed, and the link begins anew"
 
 Report = Callable[[str, str], None]
 
@@ -76,6 +78,7 @@ class Daemon:
         self._clock = clock
         self._report = report
         self._loop = Loop(clock, core.config.control.rate_hz)
+        self._suspend_watch = SuspendWatch()
         self._loop_figures = loop_figures(self._loop.stats)
         self._recorder_stats = recorder.poll()
         self._notifier = Notifier()
@@ -166,6 +169,11 @@ class Daemon:
                 self._change_area(now_ns, message)
         desired = self._pilot.step(now_ns, self._core.last)
         events = tuple(records.Event(now_ns, "info", "drive", text) for text in desired.events)
+        if self._suspend_watch.was_suspended():
+            # No age shows it, and a driver would go on commanding what its controller has stopped since.
+            self._core.renew_link()
+            self._report("link", _SUSPENDED)
+            events = (*events, records.Event(now_ns, "warning", "link", _SUSPENDED))
         mark("control")
         tick = self._core.tick(
             now_ns,

@@ -33,6 +33,27 @@ class MonotonicClock:
             time.sleep(remaining_ns * 1e-9)
 
 
+# Chosen: shorter than any controller's watchdog.
+_SUSPENDED_NS = 50_000_000
+
+
+class SuspendWatch:
+    """Notices that the computer was suspended: CLOCK_MONOTONIC stands still then, and CLOCK_BOOTTIME goes on."""
+
+    def __init__(self, read_ns: Callable[[int], int] = time.clock_gettime_ns) -> None:
+        self._read_ns = read_ns
+        monotonic_ns = read_ns(time.CLOCK_MONOTONIC)
+        self._apart_ns = read_ns(time.CLOCK_BOOTTIME) - monotonic_ns
+
+    def was_suspended(self) -> bool:
+        """Whether the computer was suspended since the last call; a thread that was held up is never taken for that."""
+        boot_ns = self._read_ns(time.CLOCK_BOOTTIME)
+        apart_ns = boot_ns - self._read_ns(time.CLOCK_MONOTONIC)
+        was_suspended = apart_ns - self._apart_ns > _SUSPENDED_NS
+        self._apart_ns = max(apart_ns, self._apart_ns)
+        return was_suspended
+
+
 # Leading binary digits that a bucket keeps, so that it is at most 1/64 wide.
 _KEPT_BITS = 7
 

@@ -114,7 +114,7 @@ class DaemonCore:
         self._controller: tuple[Identity, Limits] | None = None
         self._controller_changed = False
         self._generation = 0
-        self._link_up = False
+        self._link_up = self._link_renewed = False
         self._planner_events = PlannerEvents(config.control.fallback)
         self.state = supervisor.state
         self._last_reported: tuple[str, bool, bool] | None = None
@@ -240,10 +240,15 @@ class DaemonCore:
             self.area.notify(self.obstacle_source.refused.new_messages())
         return self.area.begin(now_ns, by_hand)
 
+    def renew_link(self) -> None:
+        """Have the driver begin anew with its robot in the next tick, as after a loss of the link."""
+        self._link_renewed = True
+
     def _follow_link(self, now_ns: int) -> None:
         """Notify the driver when the link comes and goes; a link renewed between two ticks is both."""
         up = self.transport.state is LinkState.UP
-        renewed = self.transport.generation != self._generation
+        renewed = self.transport.generation != self._generation or self._link_renewed
+        self._link_renewed = False
         if self._link_up and (not up or renewed):
             self.driver.link_down(now_ns)
             self._link_up = False

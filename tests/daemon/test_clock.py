@@ -3,7 +3,7 @@ import time
 import pytest
 from hypothesis import strategies as st
 
-from disco_hw.daemon.loop import MonotonicClock
+from disco_hw.daemon.loop import MonotonicClock, SuspendWatch
 from tests.daemon.simulated_clock import SimulatedClock
 from tests.tables import examples
 
@@ -46,3 +46,27 @@ def test_simulated_clock_moves_only_when_asked_and_never_back(moves):
 def test_simulated_clock_refuses_to_run_backwards():
     with pytest.raises(ValueError, match="backwards"):
         SimulatedClock().advance_ns(-1)
+
+
+def test_a_suspend_is_noticed_once_and_a_thread_that_is_held_up_between_two_clocks_is_none():
+    now_ns = {time.CLOCK_MONOTONIC: 10**9, time.CLOCK_BOOTTIME: 5 * 10**9}
+    held_up_ns = [0]
+
+    def read_ns(clock):
+        found_ns = now_ns[clock]
+        for each in now_ns:
+            now_ns[each] += held_up_ns[0]
+        return found_ns
+
+    watch = SuspendWatch(read_ns)
+    for held_up_ns[0] in (0, 10**9, 0):
+        assert not watch.was_suspended()
+    now_ns[time.CLOCK_BOOTTIME] += 60_000_000
+    assert watch.was_suspended()
+    assert not watch.was_suspended()
+
+
+def test_a_computer_that_is_not_suspended_is_not_taken_for_one():
+    watch = SuspendWatch()
+    time.sleep(0.06)
+    assert not watch.was_suspended()

@@ -6,8 +6,9 @@ import pytest
 
 from disco_hw.daemon.daemon import Daemon
 from disco_hw.log.recorder import NullRecorder
-from disco_hw.runtime import State
+from disco_hw.runtime import IN_USE, State
 from disco_hw.runtime.assembly import assemble_core, create_pipeline, driver_of
+from disco_hw.runtime.core import PilotTick, TaskPilot
 from disco_hw.runtime.pipeline import Manual, NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -21,6 +22,20 @@ MS = 1_000_000
 # The fastest that the example of each driver allows, with wheels of 0.06 m.
 SPEEDS_RAD_S = {"agilex": 24.0, "odrive": 11.0, "roboclaw": 5.0, "ros2_base": 24.0, "vesc": 11.0}
 SLOW = {"odrive": "stop_deceleration_rad_s2 = 4.0", "vesc": "stop_deceleration_rad_s2 = 4.0"}
+
+
+class Recorder(NullRecorder):
+    watched = False
+
+
+class Hand(TaskPilot):
+    """Drives on by hand."""
+
+    def __init__(self, motion):
+        self._motion = motion
+
+    def step(self, now_ns, last):
+        return PilotTick(motion=self._motion, by_hand=True)
 
 
 class Driven:
@@ -47,11 +62,11 @@ class Driven:
             config, self.host, driver_of(config), pipeline, NullRecorder(), needs_pose=False, adaptation=None
         )
         self.core.directions = None
-        self._now_ns = START_NS
+        self._now_ns, self._suspended_ns = START_NS, 0
         self.motion = Manual(speed_rad_s, speed_rad_s)
         self.daemon = Daemon(
-            self.core, None, SimpleNamespace(poll=lambda: None), self, SimpleNamespace(received=None),
-            lambda *_text: None, SimpleNamespace(done=False),
+            self.core, SimpleNamespace(poll=list), Recorder(), self, SimpleNamespace(received=None),
+            lambda *_text: None, Hand(self.motion),
         )  # fmt: skip
 
     def now_ns(self):
@@ -60,12 +75,23 @@ class Driven:
     def sleep_until_ns(self, deadline_ns):
         while self._now_ns < deadline_ns:
             self._now_ns += MS
-            for received in self.robot.receive():
-                self.rig.receive(self._now_ns, received.frame)
-            self.rig.step(self._now_ns)
+            self._step_robot()
             for frame in self.rig.drain():
                 sent = Frame(frame.can_id, frame.data, frame.extended)
                 self.robot.send(OutgoingFrame(sent, self._now_ns + MS), self._now_ns)
+
+    def _step_robot(self):
+        now_ns = self._now_ns + self._suspended_ns
+        for received in self.robot.receive():
+            self.rig.receive(now_ns, received.frame)
+        self.rig.step(now_ns)
+
+    def suspend(self, duration_s):
+        """The clock of this computer stands still; the robot's time goes on, and what it sends is lost."""
+        for _ in range(round(1e3 * duration_s)):
+            self._suspended_ns += MS
+            self._step_robot()
+            self.rig.drain()
 
     def run(self, duration_s, *requests):
         for _ in range(round(50 * duration_s)):
@@ -85,6 +111,20 @@ class Driven:
 @pytest.fixture(params=SPEEDS_RAD_S)
 def name(request):
     return request.param
+
+
+def test_after_a_suspend_of_this_computer_the_robot_does_not_drive_on(tmp_path, name):
+    driven = Driven(tmp_path, name)
+    driven.drive()
+    driven.suspend(20.0)
+    driven.daemon._suspend_watch = SimpleNamespace(was_suspended=[*(50 * [False]), True].pop)
+    fastest_rad_s = driven.rig.speed_rad_s
+    for _ in range(50):
+        driven.daemon._tick(driven.now_ns())
+        driven.sleep_until_ns(driven.now_ns() + 20 * MS)
+        fastest_rad_s = max(fastest_rad_s, driven.rig.speed_rad_s)
+    assert fastest_rad_s < 0.1
+    assert driven.core.state not in IN_USE
 
 
 def test_of_a_fence_into_which_the_task_does_not_fit_that_is_said(tmp_path):
