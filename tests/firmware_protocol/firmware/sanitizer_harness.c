@@ -7,6 +7,7 @@
 
 #include "disco_robot.h"
 #include "firmware.h"
+#include "parameter_record.h"
 #include "protocol_constants.h"
 #include "serial_framing.h"
 #include "slcan.h"
@@ -166,7 +167,14 @@ int main(int argc, char **argv)
     bool mad = false;
     robot.authenticated = (argc > 3) && (argv[3][0] == '1');
     seed = UINT64_C(0x9E3779B97F4A7C15);
-    disco_firmware_init(&core, &robot, 1u, 0u);
+    uint8_t record[DISCO_RECORD_LENGTH];
+    disco_record_pack(&robot, record);
+    disco_config_t kept = robot;
+    if (!disco_record_unpack(record, &kept)) {
+        (void)printf("a record that was packed is not read\n");
+        return 1;
+    }
+    disco_firmware_init(&core, &kept, 1u, 0u);
     for (uint32_t cycle = 1u; cycle <= cycles; cycle++) {
         disco_inputs_t in = {.temperature = {25.0f, 25.0f}, .encoder_valid = {true, true}, .voltage = 24.0f};
         disco_frame_t frame;
