@@ -22,14 +22,16 @@ from disco_hw.model.drift import NO_DRIFT, Drift
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 6, 6, 5
+PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 7, 7, 5
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
 1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
 weights, and shorter steps below 0.2 m/s. 4: along a line of way-points tabulated twice as finely. 5: against the ground
 that carries the robot, where the log's beliefs say so. 6: with the lag of the body's sideways speed, where they say so,
 another weight of the end, and tables of long paths as fine as those of short ones; `control.disturbance`, followed up
-to `DISTURBANCE_UNTIL_VERSION`, does nothing. Logs since `SAME_SINCE_VERSION` are replayed alike.
+to `DISTURBANCE_UNTIL_VERSION`, does nothing. 7: from commands that the model says do not turn the wheels as fast, and
+further ahead where the tracked point lies far behind the centre of rotation. Logs since `SAME_SINCE_VERSION` are
+replayed alike.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter
@@ -38,6 +40,10 @@ LONGEST_STEP_S, LONGEST_REFINED_STEP_S = 0.25, USUAL_STEP_S
 # Noise of a fast robot grows with this power of its speed: with less it stays beside tight circles, with more it is
 # pulled off them.
 FASTER_NOISE = 0.2
+# With the tracked point behind the centre of rotation an error of the heading grows e-fold over each x_icr of the way.
+# A plan over fewer x_icr than so many leaves it to grow: with 1.5 robots of up to 2 m stayed up to 0.3 m off a circle.
+LEAST_WAY_X_ICR = 2.5
+LONGEST_HORIZON = 500
 USUAL_WIDE = 3.0
 
 Uncertainty = Literal["ut", "mc", "joint", "point"]
@@ -214,8 +220,8 @@ class DiscoSettings:
         return cls(sampler=sampler, step_s=step_s, refine=refine)
 
     @classmethod
-    def from_config(cls, control: config.Control, speed_m_s: float) -> DiscoSettings:
-        """Return the settings that robot.toml asks for, for its task's speed."""
+    def from_config(cls, control: config.Control, speed_m_s: float, x_icr_m: float) -> DiscoSettings:
+        """Return the settings that robot.toml asks for, for its task's speed and a robot of this x_icr."""
         if control.mode == "paper":
             settings = cls.paper()
         else:
@@ -224,9 +230,13 @@ class DiscoSettings:
         if control.step_s is not None:
             # The number of steps that goes with steps of the task's speed says nothing of others.
             step_s, horizon = control.step_s, horizon if control.mode == "paper" else Sampler().horizon
+        backwards = control.facing == "backwards"
+        if control.mode != "paper":
+            behind_m = -x_icr_m if backwards else x_icr_m
+            least = math.ceil(LEAST_WAY_X_ICR * behind_m / (speed_m_s * step_s))
+            horizon = min(max(horizon, least), LONGEST_HORIZON)
         horizon = horizon if control.horizon is None else control.horizon
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)
-        backwards = control.facing == "backwards"
         return replace(settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty, backwards=backwards)
 
 

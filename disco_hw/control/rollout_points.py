@@ -38,7 +38,7 @@ class RolloutPoints:
 
     Fixed: `weights` (L,) float32, `history` steps of past commands, and what the fields of `SkidSteer` of the same
     names mean: `each`, `skip_mean`, `series`, `wide`, `euler`. Of the belief in force: the `model`, the mean
-    `mean_theta` (1, P) and its `chassis`, `mean_run` and `run` in steps of
+    `mean_theta` (1, P), by name in `mean`, and its `chassis`, `mean_run` and `run` in steps of
     the plan under the mean and under each point, the `past` that they remember, and `base`, `effects`, `ahead`,
     `scaled`, `wheels_differ` of `SkidSteer`.
     """
@@ -104,6 +104,7 @@ class RolloutPoints:
         """Put the points (L, P) of a model in force."""
         step_s = self._settings.step_s
         self.model, self.theta, self.mean_theta = model, theta, mean_point(model)
+        self.mean = dict(zip(model.parameter_names, self.mean_theta[0].tolist(), strict=True))
         self.mean_run, self.run = FreeRun(model, self.mean_theta, step_s), FreeRun(model, theta, step_s)
         delayed = [f"{s.name}.{s.effect.delayed_by}" for s in model.effects if s.effect.delayed_by is not None]
         dead = [f"{s.name}.{s.effect.dead_by}" for s in model.effects if s.effect.dead_by is not None]

@@ -9,6 +9,7 @@ import numpy as np
 
 from disco_hw.control.plan import Array, CommandLimits, DiscoSettings, PlannerState, command_history
 from disco_hw.control.rollout_points import RolloutPoints
+from disco_hw.model import plain
 from disco_hw.model.drift import NO_DRIFT_M_S
 from disco_hw.model.step import FreeRun
 
@@ -66,7 +67,7 @@ class StatePrediction:
     def start(self, state: PlannerState, t0_ns: int, elapsed_s: float) -> PlanStart:
         """Return where a plan that acts from `t0_ns` on begins, `elapsed_s` after the drive began."""
         points = self._points
-        before = self.anchor(state)
+        before = self.anchor(state, elapsed_s)
         # Sampled plans know of no drift, and are judged without it.
         drift = state.drift.vector if self._settings.refine else NO_DRIFT_M_S
         mean_means = point_means = None
@@ -82,19 +83,28 @@ class StatePrediction:
             t0_ns, elapsed_s, predicted, before, earlier, drift, state.lateral_lag_s, mean_means, point_means
         )  # fmt: skip
 
-    def anchor(self, state: PlannerState) -> tuple[float, float]:
+    def anchor(self, state: PlannerState, elapsed_s: float) -> tuple[float, float]:
         """Commands that the plan's first change is limited from.
 
-        The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, so that
-        a plan does not run away from wheels that are held back.
+        The last ones sent; but no further from the measured wheel speeds than the wheels could be behind them, or than
+        the model says that they stay, so that a plan does not run away from wheels that are held back.
         """
-        left, right = state.left_speed_rad_s, state.right_speed_rad_s
+        wheels = state.left_speed_rad_s, state.right_speed_rad_s
         if not state.sent:
-            return left, right
-        last = state.sent[-1]
-        last_left, last_right = last.left_rad_s, last.right_rad_s
-        slack = self._limits.acceleration_rad_s2 * (self._settings.step_s + self._points.chassis.response_s)
-        return min(max(last_left, left - slack), left + slack), min(max(last_right, right - slack), right + slack)
+            return wheels
+        settings, points, last = self._settings, self._points, state.sent[-1]
+        sent = aims = last.left_rad_s, last.right_rad_s
+        if points.model.effects and not settings.euler:
+            # Within a dead band wheels do not follow their command at all. The paper's mode stays as it is.
+            now = plain.RobotState(0.0, 0.0, 0.0, *wheels)
+            aim_left, aim_right = plain.wheel_targets(points.mean, now, *sent, elapsed_s, settings.step_s)
+            aims = float(aim_left), float(aim_right)
+        slack = self._limits.acceleration_rad_s2 * (settings.step_s + points.chassis.response_s)
+        left, right = (
+            min(max(command, wheel - slack - abs(command - aim)), wheel + slack + abs(command - aim))
+            for command, wheel, aim in zip(sent, wheels, aims, strict=True)
+        )
+        return left, right
 
     def commands_before(self, state: PlannerState, end_ns: int, step_s: float, count: int) -> Array:
         """Mean commands (count, 2) that act in each of the steps up to `end_ns`."""

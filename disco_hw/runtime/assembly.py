@@ -20,6 +20,7 @@ from disco_hw.adaptation.guard import (
 )
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.control.baselines import LAWS, WithFallback
+from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.control.plan import Law, LawController
 from disco_hw.control.surroundings import Surroundings
@@ -33,6 +34,7 @@ from disco_hw.fence.clearance import Boundaries
 from disco_hw.files import KEY, read_bytes
 from disco_hw.log.recorder import Recorder
 from disco_hw.model import Model
+from disco_hw.model.model import BASE_PARAMETERS
 from disco_hw.runtime.core import DaemonCore
 from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
 from disco_hw.runtime.obstacles import obstacle_source_of
@@ -55,7 +57,8 @@ _LEAST_RESPONSE_S = 0.05
 def create_planner(config: RobotConfig, model: Model) -> control.Disco:
     """DISCO for this robot's task, compiled and warmed up: takes seconds."""
     task = config.task.planned(config.control.mode)
-    settings = control.DiscoSettings.from_config(config.control, config.task.speed_m_s)
+    _, _, x_icr_m = mean_point(model)[0, : len(BASE_PARAMETERS)].tolist()
+    settings = control.DiscoSettings.from_config(config.control, config.task.speed_m_s, x_icr_m)
     planner = control.Disco(
         model,
         task,

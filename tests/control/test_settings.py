@@ -21,20 +21,38 @@ def test_paper_mode_is_the_appendix_table():
 
 
 def test_from_config_takes_size_mode_and_uncertainty():
-    settings = DiscoSettings.from_config(Control(samples=64, horizon=20, step_s=0.2, uncertainty="mc"), 0.2)
+    settings = DiscoSettings.from_config(Control(samples=64, horizon=20, step_s=0.2, uncertainty="mc"), 0.2, 0.0)
     assert (settings.sampler.samples, settings.sampler.horizon, settings.step_s) == (64, 20, 0.2)
     assert settings.uncertainty == "mc"
     assert settings.sampler.knots == 7
-    assert DiscoSettings.from_config(Control(mode="paper"), 0.2).sampler.knots is None
+    assert DiscoSettings.from_config(Control(mode="paper"), 0.2, 0.0).sampler.knots is None
 
 
 def test_a_slow_robot_plans_as_far_in_shorter_steps_where_its_plans_are_refined():
-    slow, slow_sampled = (DiscoSettings.from_config(Control(mode=mode), 0.1) for mode in ("default", "sampled"))
+    slow, slow_sampled = (DiscoSettings.from_config(Control(mode=mode), 0.1, 0.0) for mode in ("default", "sampled"))
     assert slow_sampled.step_s == pytest.approx(0.2)
     assert slow.step_s == pytest.approx(0.1)
     assert slow.sampler.horizon * slow.step_s == pytest.approx(slow_sampled.sampler.horizon * slow_sampled.step_s)
-    usual = DiscoSettings.from_config(Control(), 0.2).sampler.horizon
-    assert DiscoSettings.from_config(Control(step_s=0.2), 0.1).sampler.horizon == usual
+    usual = DiscoSettings.from_config(Control(), 0.2, 0.0).sampler.horizon
+    assert DiscoSettings.from_config(Control(step_s=0.2), 0.1, 0.0).sampler.horizon == usual
+
+
+@pytest.mark.parametrize(
+    ("control", "speed_m_s", "x_icr_m", "horizon"),
+    [
+        (Control(), 0.2, 0.238, 40),
+        (Control(), 0.2, -2.0, 40),
+        (Control(), 0.2, 0.8, 100),
+        (Control(facing="backwards"), 0.2, -0.8, 100),
+        (Control(facing="backwards"), 0.2, 0.8, 40),
+        (Control(mode="sampled", step_s=0.2), 0.1, 0.5, 63),
+        (Control(), 0.05, 2.0, 500),
+        (Control(horizon=20), 0.2, 0.8, 20),
+        (Control(mode="paper"), 0.2, 0.8, 50),
+    ],
+)
+def test_plans_cover_two_and_a_half_x_icr_where_the_tracked_point_lies_behind(control, speed_m_s, x_icr_m, horizon):
+    assert DiscoSettings.from_config(control, speed_m_s, x_icr_m).sampler.horizon == horizon
 
 
 def test_limits_of_the_robot():
