@@ -1,17 +1,24 @@
 """Poses and speeds from ROS: what is passed on to the daemon, and what is refused for which reason."""
 
+import itertools
 import math
 import os
 import random
 import threading
 import time
+from contextlib import closing
 
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2 import Bridge
+from disco_hw.bridge.ros2 import LATCHED, RELIABLE, SENSOR, Bridge, TopicReaders, UnreadCounts
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
 from disco_hw.bridge.ros2_inlets import PoseInlet, TransformInlet
 from disco_hw.config import Drive, PoseInput, Robot
@@ -289,6 +296,63 @@ def test_stopping_is_taken_from_whoever_asks(action):
 def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(action):
     assert "ros2.may_move = true" in str(refusal(action, Ros2().may_move))
     assert refusal(action, True) is None
+
+
+def qualities(reliable, latched=False):
+    return Qos(
+        Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(10),
+    )
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_over_dds_an_estop_and_requests_arrive_whatever_the_publishers_quality_of_service(tmp_path, reliable):
+    file, requests, ended = robot_file(tmp_path), [], threading.Event()
+    number = 200 + os.getpid() % 10 * 3 + reliable
+    text = f'[ros2]\ndomain = {number}\n[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    with closing(Bridge(load_setup(file))) as bridge:
+        for errands in (bridge._asking, bridge._stopping):
+            errands.add = lambda _, request: requests.append(request)
+        thread = threading.Thread(target=bridge.run, args=(ended.is_set,))
+        thread.start()
+        ctl, estop = (
+            DataWriter(bridge._participant, Topic(bridge._participant, f"rt/{name}", kind), qualities(reliable))
+            for name, kind in (("disco_hw/ctl", msg.String), ("disco_hw/estop", msg.Bool))
+        )
+        deadline = time.monotonic() + 20.0
+        while not (ctl.get_matched_subscriptions() and estop.get_matched_subscriptions()):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        estop.write(msg.Bool(True))
+        for request in ("stop", "stop", "disarm", "status"):
+            ctl.write(msg.String(request))
+        while "status" not in requests and time.monotonic() < deadline:
+            time.sleep(0.01)
+        ended.set()
+        thread.join()
+    assert [request for request in requests if request != "estop"] == ["stop", "stop", "disarm", "status"]
+    assert "estop" in requests
+
+
+def test_over_dds_a_message_counts_once_also_if_its_publisher_has_gone():
+    number, unread = 202 + os.getpid() % 10 * 3, UnreadCounts()
+    _domain, participant = Domain(number, msg.LOOPBACK), DomainParticipant(number)
+    topic = Topic(participant, "rt/button", msg.Bool)
+    readers = TopicReaders(participant, topic, (LATCHED, RELIABLE, SENSOR))
+    for reliable, latched, gone in itertools.product((True, False), repeat=3):
+        writer = DataWriter(participant, topic, qualities(reliable, latched))
+        assert readers.has_publisher()
+        for pressed in (True, False, True):
+            writer.write(msg.Bool(pressed))
+        if gone:
+            del writer
+        taken = [message.data for message, _ in readers.take(10, unread)]
+        assert taken == [True, False, True], (reliable, latched, gone)
+    del writer
+    assert not readers.has_publisher()
+    assert unread == UnreadCounts()
 
 
 class TestTransforms:
