@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -253,19 +254,21 @@ class Bridge:
         if request is not None:
             self._pad.send(now_ns, request)
 
-    def _handle_request(self, message: msg.String, _: int) -> None:
+    def _handle_request(self, message: msg.String, sent_ns: int) -> None:
         request = message.data.strip()
         errands = self._stopping if request == "estop" else self._asking
-        errands.add(self._reply_to, request)
+        errands.add(partial(self._reply_to, sent_ns), request)
 
-    def _handle_estop(self, message: msg.Bool, _: int) -> None:
+    def _handle_estop(self, message: msg.Bool, sent_ns: int) -> None:
         if message.data:
-            self._stopping.add(self._reply_to, "estop")
+            self._stopping.add(partial(self._reply_to, sent_ns), "estop")
 
-    def _reply_to(self, request: str) -> None:
+    def _reply_to(self, sent_ns: int, request: str) -> None:
         """Carry out a request and publish the reply; where the daemon is driven by hand, arming only permits speeds."""
         reply: dict[str, Any]
-        refused = ros2_commands.refusal(request, self._config.ros2.may_move)
+        # Here, as it may also have waited for its turn.
+        age_ns = time.time_ns() - sent_ns
+        refused = ros2_commands.refusal(request, self._config.ros2.may_move, age_ns)
         if refused is not None:
             reply = {"do": request, "ok": False, "error": refused}
         elif request == "arm" and self._is_hand_driven():

@@ -17,6 +17,7 @@ from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
+from disco_hw.bridge import ros2_commands
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import LATCHED, RELIABLE, SENSOR, Bridge, TopicReaders, UnreadCounts
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
@@ -289,13 +290,37 @@ def test_of_a_flood_of_requests_a_few_are_taken_in_their_order():
 
 @pytest.mark.parametrize("action", ["estop", "stop", "disarm", "status"])
 def test_stopping_is_taken_from_whoever_asks(action):
-    assert refusal(action, False) is None
+    assert refusal(action, False, 3_600_000 * MS) is None
 
 
 @pytest.mark.parametrize("action", ["arm", "arm --unrecorded", "start", "reset", "task radius_m=1", "stopping", ""])
 def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(action):
-    assert "ros2.may_move = true" in str(refusal(action, Ros2().may_move))
-    assert refusal(action, True) is None
+    assert "ros2.may_move = true" in str(refusal(action, Ros2().may_move, 0))
+    assert refusal(action, True, 0) is None
+
+
+@pytest.mark.parametrize("action", ["arm", "start", "reset", "task radius_m=1"])
+@pytest.mark.parametrize(("age_ms", "refused"), [(-60, True), (-40, False), (990, False), (1010, True), (6000, True)])
+def test_what_lets_the_robot_move_is_refused_when_it_comes_late_or_by_another_clock(action, age_ms, refused):
+    assert ("sent over 1 s ago" in str(refusal(action, True, age_ms * MS))) is refused
+
+
+def test_a_late_request_is_refused_with_a_reply_and_a_late_stop_is_passed_on(tmp_path, monkeypatch):
+    file = robot_file(tmp_path)
+    text = f"[ros2]\ndomain = {203 + os.getpid() % 8 * 4}\nmay_move = true\n"
+    text += f'[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    passed, replies = [], []
+    monkeypatch.setattr(ros2_commands, "request_daemon", lambda _, request, __: passed.append(request) or {"ok": True})
+    with closing(Bridge(load_setup(file))) as bridge:
+        bridge._publish = lambda _, reply: replies.append(reply.data)
+        for late_s in (6, 0):
+            for request in ("start", "stop"):
+                bridge._handle_request(msg.String(request), time.time_ns() - late_s * 1_000_000_000)
+        bridge._asking._pool.shutdown()
+    assert passed == ["stop", "start", "stop"]
+    assert len(replies) == 4
+    assert "sent over 1 s ago" in replies[0]
 
 
 def qualities(reliable, latched=False):
@@ -309,7 +334,7 @@ def qualities(reliable, latched=False):
 @pytest.mark.parametrize("reliable", [True, False])
 def test_over_dds_an_estop_and_requests_arrive_whatever_the_publishers_quality_of_service(tmp_path, reliable):
     file, requests, ended = robot_file(tmp_path), [], threading.Event()
-    number = 200 + os.getpid() % 10 * 3 + reliable
+    number = 200 + os.getpid() % 8 * 4 + reliable
     text = f'[ros2]\ndomain = {number}\n[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
     file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
     with closing(Bridge(load_setup(file))) as bridge:
@@ -337,7 +362,7 @@ def test_over_dds_an_estop_and_requests_arrive_whatever_the_publishers_quality_o
 
 
 def test_over_dds_a_message_counts_once_also_if_its_publisher_has_gone():
-    number, unread = 202 + os.getpid() % 10 * 3, UnreadCounts()
+    number, unread = 202 + os.getpid() % 8 * 4, UnreadCounts()
     _domain, participant = Domain(number, msg.LOOPBACK), DomainParticipant(number)
     topic = Topic(participant, "rt/button", msg.Bool)
     readers = TopicReaders(participant, topic, (LATCHED, RELIABLE, SENSOR))
