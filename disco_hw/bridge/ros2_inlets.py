@@ -209,7 +209,8 @@ class TransformInlet:
             self.refused["transforms that the ones after them in the chain do not reach"] += 1
             return None
         repeated = bool(after) and len(leading) > 1 and leading[-1][1] == leading[-2][1]
-        if repeated and t_ns < self._received_ns + _REPEAT_NS:
+        # A time before that of the pose before is of a clock that was set back.
+        if repeated and 0 <= t_ns - self._received_ns < _REPEAT_NS:
             return None
         self._received_ns = t_ns
         motions = [self._motion(name, t_ns if name == child else None) for _, name in self._chain]

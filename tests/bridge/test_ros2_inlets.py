@@ -478,6 +478,17 @@ class TestTransforms:
         self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
         assert self.poses_of(inlet, 0, "map", "odom", (3.0, 0.0, 0.0))
 
+    @pytest.mark.parametrize("correction_first", [True, False])
+    def test_a_robot_that_stands_still_has_poses_again_after_a_clock_was_set_back(self, inlet, correction_first):
+        edges = [("map", "odom"), ("odom", "base_footprint")]
+        poses = []
+        for begin_ms in (3_600_000, 0):
+            for at_ms in range(begin_ms, begin_ms + 2000, 100):
+                for parent, child in edges if correction_first else reversed(edges):
+                    poses += self.poses_of(inlet, at_ms, parent, child, (1.0, 0.0, 0.0))
+        stamps_ms = [(msg.time_of(pose.header.stamp) - WALL_NS) // MS for pose in poses]
+        assert len([at_ms for at_ms in stamps_ms if at_ms < 2000]) == 4
+
 
 def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the_daemon(tmp_path):
     file = robot_file(tmp_path)
