@@ -10,9 +10,11 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,9 +53,9 @@ _ACKNOWLEDGED = Policy.Reliability.Reliable(duration(milliseconds=5))
 SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
 RELIABLE = Qos(_ACKNOWLEDGED, Policy.Durability.Volatile, Policy.History.KeepLast(10))
 NEWEST = Qos(_ACKNOWLEDGED, Policy.Durability.Volatile, Policy.History.KeepLast(1))
-_LATCHED = Qos(_ACKNOWLEDGED, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
+_NEWEST_LATCHED = Qos(_ACKNOWLEDGED, Policy.Durability.TransientLocal, Policy.History.KeepLast(1))
 _TRANSFORMS = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(100))
-_STATIC = Qos(_ACKNOWLEDGED, Policy.Durability.TransientLocal, Policy.History.KeepLast(100))
+LATCHED = Qos(_ACKNOWLEDGED, Policy.Durability.TransientLocal, Policy.History.KeepLast(100))
 
 _PUBLISHED: tuple[tuple[str, type, Qos], ...] = (
     (out.ODOM, msg.Odometry, RELIABLE),
@@ -61,7 +63,7 @@ _PUBLISHED: tuple[tuple[str, type, Qos], ...] = (
     (out.TF, msg.TFMessage, RELIABLE),
     (out.PLAN, msg.RosPath, RELIABLE),
     (out.POSE, msg.PoseWithCovarianceStamped, RELIABLE),
-    (out.STATE, msg.String, _LATCHED),
+    (out.STATE, msg.String, _NEWEST_LATCHED),
     (out.DIAGNOSTICS, msg.DiagnosticArray, RELIABLE),
     (REPLY, msg.String, RELIABLE),
 )
@@ -177,34 +179,37 @@ class Bridge:
         self._to_daemon.close()
         self._obstacle_link.close()
 
-    def _create_readers(self, namespace: str) -> Iterator[tuple[DataReader[Any], _Handler]]:
-        """Yield each reader of a topic with the method that handles its messages."""
+    def _create_readers(self, namespace: str) -> Iterator[tuple[TopicReaders, _Handler]]:
+        """Yield the readers of each topic with the method that handles their messages."""
         # One for each type that a topic may have: only the one that the sender has is ever matched.
         if self._pose is not None and self._pose.topic == ros2_inlets.TRANSFORMS:
-            yield self._reader(out.TF, msg.TFMessage, _TRANSFORMS, namespace), self._handle_transforms
-            yield self._reader(TF_STATIC, msg.TFMessage, _STATIC, namespace), self._handle_static_transforms
+            yield self._reader(namespace, out.TF, msg.TFMessage, _TRANSFORMS), self._handle_transforms
+            yield self._reader(namespace, TF_STATIC, msg.TFMessage, LATCHED), self._handle_static_transforms
         elif self._pose is not None:
             for pose in ros2_inlets.TYPES:
-                yield self._reader(self._pose.topic, pose, SENSOR, namespace), self._handle_pose
+                yield self._reader(namespace, self._pose.topic, pose, SENSOR), self._handle_pose
         for speed in () if self._base_on_ros else ros2_commands.TYPES:
-            yield self._reader(CMD_VEL, speed, SENSOR, namespace), self._handle_speed
+            yield self._reader(namespace, CMD_VEL, speed, SENSOR), self._handle_speed
         for obstacles in () if self._config.fence.obstacles_port is None else ros2_obstacles.TYPES:
-            yield self._reader(ros2_obstacles.TOPIC, obstacles, SENSOR, namespace), self._handle_obstacles
-        yield self._reader(CTL, msg.String, RELIABLE, namespace), self._handle_request
-        yield self._reader(ESTOP, msg.Bool, RELIABLE, namespace), self._handle_estop
+            yield self._reader(namespace, ros2_obstacles.TOPIC, obstacles, SENSOR), self._handle_obstacles
+        yield self._reader(namespace, CTL, msg.String, RELIABLE, SENSOR), self._handle_request
+        # Each by itself: an e-stop that counts twice does no harm, and it must not wait for what was lost before it.
+        for qos in (RELIABLE, SENSOR):
+            yield self._reader(namespace, ESTOP, msg.Bool, qos), self._handle_estop
 
-    def _reader(self, topic: str, kind: Any, qos: Qos, namespace: str) -> DataReader[Any]:
-        return DataReader(self._participant, Topic(self._participant, wire_name(topic, namespace), kind), qos)
+    def _reader(self, namespace: str, topic: str, kind: Any, *qualities: Qos) -> TopicReaders:
+        return TopicReaders(self._participant, Topic(self._participant, wire_name(topic, namespace), kind), qualities)
 
     def _receive(self) -> None:
         try:
             waiting = WaitSet(self._participant)
-            for reader, _ in self._readers:
-                waiting.attach(ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead))
+            for readers, _ in self._readers:
+                for reader in readers.readers:
+                    waiting.attach(ReadCondition(reader, ViewState.Any | InstanceState.Any | SampleState.NotRead))
             while not self._ended.is_set():
                 waiting.wait(duration(milliseconds=50))
-                for reader, handle in self._readers:
-                    for message, sent_ns in take_samples(reader, _MAX_BATCH, self._unread):
+                for readers, handle in self._readers:
+                    for message, sent_ns in readers.take(_MAX_BATCH, self._unread):
                         handle(message, sent_ns)
         except BaseException as failure:
             self._failure = failure
@@ -249,19 +254,21 @@ class Bridge:
         if request is not None:
             self._pad.send(now_ns, request)
 
-    def _handle_request(self, message: msg.String, _: int) -> None:
+    def _handle_request(self, message: msg.String, sent_ns: int) -> None:
         request = message.data.strip()
         errands = self._stopping if request == "estop" else self._asking
-        errands.add(self._reply_to, request)
+        errands.add(partial(self._reply_to, sent_ns), request)
 
-    def _handle_estop(self, message: msg.Bool, _: int) -> None:
+    def _handle_estop(self, message: msg.Bool, sent_ns: int) -> None:
         if message.data:
-            self._stopping.add(self._reply_to, "estop")
+            self._stopping.add(partial(self._reply_to, sent_ns), "estop")
 
-    def _reply_to(self, request: str) -> None:
+    def _reply_to(self, sent_ns: int, request: str) -> None:
         """Carry out a request and publish the reply; where the daemon is driven by hand, arming only permits speeds."""
         reply: dict[str, Any]
-        refused = ros2_commands.refusal(request, self._config.ros2.may_move)
+        # Here, as it may also have waited for its turn.
+        age_ns = time.time_ns() - sent_ns
+        refused = ros2_commands.refusal(request, self._config.ros2.may_move, age_ns)
         if refused is not None:
             reply = {"do": request, "ok": False, "error": refused}
         elif request == "arm" and self._is_hand_driven():
@@ -340,6 +347,42 @@ def take_samples(reader: DataReader[Any], most: int, unread: UnreadCounts) -> It
     for sample in samples:
         if sample.sample_info.valid_data:
             yield sample, sample.sample_info.source_timestamp
+
+
+class TopicReaders:
+    """Readers of one topic that differ in quality of service, so that publishers of any are heard.
+
+    A publisher is heard by the first reader that matches it: its messages keep their order, and none counts twice.
+    `qualities`: of each reader, the strictest first; the last matches all publishers that any of them matches.
+    """
+
+    def __init__(self, participant: DomainParticipant, topic: Topic[Any], qualities: Sequence[Qos]) -> None:
+        self.readers = [DataReader(participant, topic, qos) for qos in qualities]
+        # Publishers that each reader had messages of, as one that has gone is matched no more.
+        self._heard: list[deque[int]] = [deque(maxlen=_MAX_BATCH) for _ in qualities]
+
+    def take(self, most: int, unread: UnreadCounts) -> Iterator[tuple[Any, int]]:
+        """Yield samples with their source time stamps, at most so many of each reader; count unreadable ones."""
+        heard_before: set[int] = set()
+        for reader, heard in zip(self.readers, self._heard, strict=True):
+            for message, sent_ns in take_samples(reader, most, unread):
+                publisher = message.sample_info.publication_handle
+                if publisher not in heard_before:
+                    heard.append(publisher)
+                    yield message, sent_ns
+            heard_before |= _matched(reader).union(heard)
+
+    def has_publisher(self) -> bool:
+        """Whether any publisher of the topic can be heard."""
+        return bool(_matched(self.readers[-1]))
+
+
+def _matched(reader: DataReader[Any]) -> set[int]:
+    """Return the handles of the publishers that a reader matches, as samples have them."""
+    while True:
+        # The binding asks for their number first, and fails where another has come since.
+        with contextlib.suppress(IndexError):
+            return {handle % (1 << 64) for handle in reader.get_matched_publications()}
 
 
 def _publisher_of(message: Any) -> str | None:

@@ -24,7 +24,17 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2 import NEWEST, RELIABLE, SENSOR, UnreadCounts, join_domain, take_samples, wire_name
+from disco_hw.bridge.ros2 import (
+    LATCHED,
+    NEWEST,
+    RELIABLE,
+    SENSOR,
+    TopicReaders,
+    UnreadCounts,
+    join_domain,
+    take_samples,
+    wire_name,
+)
 from disco_hw.bridge.ros2_inlets import WheelInlet
 from disco_hw.config import RobotConfig, load_robot_config
 from disco_hw.daemon import peer_uid
@@ -170,7 +180,8 @@ class BaseBridge:
         self._others = DataReader(self._participant, topic(settings.speed_topic, speed), _OTHERS_QOS)
         self._wheels = DataReader(self._participant, topic(settings.wheels_from, wheels), SENSOR)
         buttons = topic(settings.stop_topic, msg.Bool) if settings.stop_topic else None
-        self._button = None if buttons is None else DataReader(self._participant, buttons, RELIABLE)
+        qualities = (LATCHED, RELIABLE, SENSOR)
+        self._button = None if buttons is None else TopicReaders(self._participant, buttons, qualities)
         self.end.receives_button = self._button is None
         self._others_ns = self._wheels_ns = -_OTHERS_NS
         self._step_ns = self._state_ns = self._look_ns = 0
@@ -230,12 +241,12 @@ class BaseBridge:
         if self._button is not None:
             self._handle_button(self._button)
 
-    def _handle_button(self, reader: DataReader[Any]) -> None:
+    def _handle_button(self, readers: TopicReaders) -> None:
         """Read the base's stop button; an unreadable message or no publisher ends driving, as a pressed one does."""
         before = replace(self._unread)
-        for message, _ in self._samples(reader):
+        for message, _ in readers.take(_MAX_BATCH, self._unread):
             self.end.button, self.end.receives_button = message.data, True
-        if self._unread != before or not reader.get_matched_publications():
+        if self._unread != before or not readers.has_publisher():
             self.end.receives_button = False
 
     def _send_due(self, now_ns: int) -> None:

@@ -20,7 +20,7 @@ from typing import Any
 import msgspec
 
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2_inlets import AHEAD_NS
+from disco_hw.bridge.ros2_inlets import AHEAD_NS, OLDEST_NS
 from disco_hw.config import Drive, Robot
 from disco_hw.daemon import ask, connect
 from disco_hw.daemon.emergency import stop_robot
@@ -174,14 +174,21 @@ class Errands:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
-def refusal(request: str, may_move: bool) -> str | None:
-    """Return why a request is not accepted from ROS 2, where senders are unknown; None for stops, which always are."""
-    if may_move or request.split(" ", 1)[0] in _ALWAYS:
+def refusal(request: str, may_move: bool, age_ns: int) -> str | None:
+    """Return why a request is not accepted from ROS 2, where senders are unknown; None for stops, which always are.
+
+    `age_ns`: since it was sent, by the sender's wall clock.
+    """
+    if request.split(" ", 1)[0] in _ALWAYS:
         return None
-    return (
-        "not accepted from ROS 2, because any node in the domain could have sent it; set ros2.may_move = true in "
-        "robot.toml, or use disco-hw ctl"
-    )
+    if not may_move:
+        return (
+            "not accepted from ROS 2, because any node in the domain could have sent it; set ros2.may_move = true in "
+            "robot.toml, or use disco-hw ctl"
+        )
+    if not -AHEAD_NS <= age_ns <= OLDEST_NS:
+        return "sent over 1 s ago, or by another clock; synchronise the clocks, then send the request again"
+    return None
 
 
 def request_daemon(robot: Path, request: str, link: str | None) -> dict[str, Any]:

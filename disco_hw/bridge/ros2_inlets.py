@@ -27,7 +27,8 @@ TYPES = (msg.PoseStamped, msg.PoseWithCovarianceStamped, msg.Odometry)
 PoseMessage = msg.PoseStamped | msg.PoseWithCovarianceStamped | msg.Odometry
 # Clocks of two computers differ, and some transforms are dated ahead; further ahead the stamp is of another clock.
 AHEAD_NS = 50_000_000
-_OLDEST_POSE_NS = 1_000_000_000
+OLDEST_NS = 1_000_000_000
+"""Age at which a pose, or a request that may move the robot, is too old."""
 _SHORTEST_NS = 4_000_000
 _UNIT_MARGIN = 0.02
 TRANSFORMS = "tf"
@@ -48,7 +49,7 @@ class PoseInlet:
         self.why = ""
         self._publishers = SenderGate(silence_s)
         self._settings = settings
-        self._newest_ns = self._passed_ns = -_OLDEST_POSE_NS
+        self._newest_ns = self._passed_ns = -OLDEST_NS
 
     def datagram(
         self, message: PoseMessage, sent_ns: int, mono_ns: int, wall_ns: int, publisher: Hashable = None
@@ -84,7 +85,7 @@ class PoseInlet:
         if frame != settings.frame.lstrip("/"):
             return f'in frame "{frame[:40]}", not pose.frame "{settings.frame}"', None
         age_ns = wall_ns - (msg.time_of(message.header.stamp) or sent_ns)
-        if not -AHEAD_NS <= age_ns <= _OLDEST_POSE_NS:
+        if not -AHEAD_NS <= age_ns <= OLDEST_NS:
             return "stamped by another clock, or too late; synchronise the clocks and leave use_sim_time off", None
         t_ns = mono_ns - max(0, age_ns)
         if t_ns <= self._newest_ns:
@@ -208,7 +209,8 @@ class TransformInlet:
             self.refused["transforms that the ones after them in the chain do not reach"] += 1
             return None
         repeated = bool(after) and len(leading) > 1 and leading[-1][1] == leading[-2][1]
-        if repeated and t_ns < self._received_ns + _REPEAT_NS:
+        # A time before that of the pose before is of a clock that was set back.
+        if repeated and 0 <= t_ns - self._received_ns < _REPEAT_NS:
             return None
         self._received_ns = t_ns
         motions = [self._motion(name, t_ns if name == child else None) for _, name in self._chain]

@@ -14,13 +14,15 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from cyclonedds.core import Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
+from disco_hw.bridge import ros2_base
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2 import RELIABLE
+from disco_hw.bridge.ros2 import LATCHED, RELIABLE, join_domain
 from disco_hw.bridge.ros2_base import BaseBridge, Clients, run_base_bridge
 from disco_hw.bridge.ros2_inlets import WheelInlet
 from disco_hw.config import load_robot_config
@@ -361,6 +363,34 @@ def test_over_dds_the_button_and_the_daemons_end_stop_the_base(over_dds):
     over_dds.daemon.close()
     over_dds.daemon = watcher
     over_dds.until(lambda flags: not flags & (wire.DRIVING | wire.FELL_SILENT))
+
+
+@pytest.mark.parametrize("over_dds", ["/button"], indirect=True)
+def test_over_dds_a_button_that_speaks_best_effort_is_heard(over_dds):
+    button = over_dds.writer("button", msg.Bool, Qos(Policy.Reliability.BestEffort))
+    over_dds.until(lambda flags: not flags & wire.BUTTON, lambda: button.write(msg.Bool(False)))
+    over_dds.until(lambda flags: flags & wire.BUTTON, lambda: button.write(msg.Bool(True)))
+
+
+def test_over_dds_a_button_that_spoke_once_before_the_bridge_was_there_is_heard_if_it_is_latched(
+    tmp_path, clients, monkeypatch
+):
+    latched = []
+
+    def join_second(config):
+        domain, participant = join_domain(config)
+        latched.append(DataWriter(participant, Topic(participant, "rt/button", msg.Bool), LATCHED))
+        latched[0].write(msg.Bool(False))
+        return domain, participant
+
+    monkeypatch.setattr(ros2_base, "join_domain", join_second)
+    over_dds = OverDds(tmp_path, clients, "/button")
+    try:
+        over_dds.until(lambda flags: not flags & wire.BUTTON)
+        latched[0].write(msg.Bool(True))
+        over_dds.until(lambda flags: flags & wire.BUTTON)
+    finally:
+        over_dds.end()
 
 
 @pytest.mark.parametrize(

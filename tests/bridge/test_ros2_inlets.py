@@ -1,17 +1,25 @@
 """Poses and speeds from ROS: what is passed on to the daemon, and what is refused for which reason."""
 
+import itertools
 import math
 import os
 import random
 import threading
 import time
+from contextlib import closing
 
 import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+
+from disco_hw.bridge import ros2_commands
 from disco_hw.bridge import ros2_messages as msg
-from disco_hw.bridge.ros2 import Bridge
+from disco_hw.bridge.ros2 import LATCHED, RELIABLE, SENSOR, Bridge, TopicReaders, UnreadCounts
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
 from disco_hw.bridge.ros2_inlets import PoseInlet, TransformInlet
 from disco_hw.config import Drive, PoseInput, Robot
@@ -282,13 +290,94 @@ def test_of_a_flood_of_requests_a_few_are_taken_in_their_order():
 
 @pytest.mark.parametrize("action", ["estop", "stop", "disarm", "status"])
 def test_stopping_is_taken_from_whoever_asks(action):
-    assert refusal(action, False) is None
+    assert refusal(action, False, 3_600_000 * MS) is None
 
 
 @pytest.mark.parametrize("action", ["arm", "arm --unrecorded", "start", "reset", "task radius_m=1", "stopping", ""])
 def test_what_lets_the_robot_move_is_taken_only_where_robot_toml_says_so(action):
-    assert "ros2.may_move = true" in str(refusal(action, Ros2().may_move))
-    assert refusal(action, True) is None
+    assert "ros2.may_move = true" in str(refusal(action, Ros2().may_move, 0))
+    assert refusal(action, True, 0) is None
+
+
+@pytest.mark.parametrize("action", ["arm", "start", "reset", "task radius_m=1"])
+@pytest.mark.parametrize(("age_ms", "refused"), [(-60, True), (-40, False), (990, False), (1010, True), (6000, True)])
+def test_what_lets_the_robot_move_is_refused_when_it_comes_late_or_by_another_clock(action, age_ms, refused):
+    assert ("sent over 1 s ago" in str(refusal(action, True, age_ms * MS))) is refused
+
+
+def test_a_late_request_is_refused_with_a_reply_and_a_late_stop_is_passed_on(tmp_path, monkeypatch):
+    file = robot_file(tmp_path)
+    text = f"[ros2]\ndomain = {203 + os.getpid() % 8 * 4}\nmay_move = true\n"
+    text += f'[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    passed, replies = [], []
+    monkeypatch.setattr(ros2_commands, "request_daemon", lambda _, request, __: passed.append(request) or {"ok": True})
+    with closing(Bridge(load_setup(file))) as bridge:
+        bridge._publish = lambda _, reply: replies.append(reply.data)
+        for late_s in (6, 0):
+            for request in ("start", "stop"):
+                bridge._handle_request(msg.String(request), time.time_ns() - late_s * 1_000_000_000)
+        bridge._asking._pool.shutdown()
+    assert passed == ["stop", "start", "stop"]
+    assert len(replies) == 4
+    assert "sent over 1 s ago" in replies[0]
+
+
+def qualities(reliable, latched=False):
+    return Qos(
+        Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.History.KeepLast(10),
+    )
+
+
+@pytest.mark.parametrize("reliable", [True, False])
+def test_over_dds_an_estop_and_requests_arrive_whatever_the_publishers_quality_of_service(tmp_path, reliable):
+    file, requests, ended = robot_file(tmp_path), [], threading.Event()
+    number = 200 + os.getpid() % 8 * 4 + reliable
+    text = f'[ros2]\ndomain = {number}\n[daemon]\ncontrol_socket = "{tmp_path / "control"}"\n'
+    file.write_text(file.read_text(encoding="utf-8") + text, encoding="utf-8")
+    with closing(Bridge(load_setup(file))) as bridge:
+        for errands in (bridge._asking, bridge._stopping):
+            errands.add = lambda _, request: requests.append(request)
+        thread = threading.Thread(target=bridge.run, args=(ended.is_set,))
+        thread.start()
+        ctl, estop = (
+            DataWriter(bridge._participant, Topic(bridge._participant, f"rt/{name}", kind), qualities(reliable))
+            for name, kind in (("disco_hw/ctl", msg.String), ("disco_hw/estop", msg.Bool))
+        )
+        deadline = time.monotonic() + 20.0
+        while not (ctl.get_matched_subscriptions() and estop.get_matched_subscriptions()):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        estop.write(msg.Bool(True))
+        for request in ("stop", "stop", "disarm", "status"):
+            ctl.write(msg.String(request))
+        while "status" not in requests and time.monotonic() < deadline:
+            time.sleep(0.01)
+        ended.set()
+        thread.join()
+    assert [request for request in requests if request != "estop"] == ["stop", "stop", "disarm", "status"]
+    assert "estop" in requests
+
+
+def test_over_dds_a_message_counts_once_also_if_its_publisher_has_gone():
+    number, unread = 202 + os.getpid() % 8 * 4, UnreadCounts()
+    _domain, participant = Domain(number, msg.LOOPBACK), DomainParticipant(number)
+    topic = Topic(participant, "rt/button", msg.Bool)
+    readers = TopicReaders(participant, topic, (LATCHED, RELIABLE, SENSOR))
+    for reliable, latched, gone in itertools.product((True, False), repeat=3):
+        writer = DataWriter(participant, topic, qualities(reliable, latched))
+        assert readers.has_publisher()
+        for pressed in (True, False, True):
+            writer.write(msg.Bool(pressed))
+        if gone:
+            del writer
+        taken = [message.data for message, _ in readers.take(10, unread)]
+        assert taken == [True, False, True], (reliable, latched, gone)
+    del writer
+    assert not readers.has_publisher()
+    assert unread == UnreadCounts()
 
 
 class TestTransforms:
@@ -388,6 +477,17 @@ class TestTransforms:
         self.poses_of(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
         self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
         assert self.poses_of(inlet, 0, "map", "odom", (3.0, 0.0, 0.0))
+
+    @pytest.mark.parametrize("correction_first", [True, False])
+    def test_a_robot_that_stands_still_has_poses_again_after_a_clock_was_set_back(self, inlet, correction_first):
+        edges = [("map", "odom"), ("odom", "base_footprint")]
+        poses = []
+        for begin_ms in (3_600_000, 0):
+            for at_ms in range(begin_ms, begin_ms + 2000, 100):
+                for parent, child in edges if correction_first else reversed(edges):
+                    poses += self.poses_of(inlet, at_ms, parent, child, (1.0, 0.0, 0.0))
+        stamps_ms = [(msg.time_of(pose.header.stamp) - WALL_NS) // MS for pose in poses]
+        assert len([at_ms for at_ms in stamps_ms if at_ms < 2000]) == 4
 
 
 def test_over_dds_the_bridges_own_odometry_and_a_localisation_make_poses_for_the_daemon(tmp_path):
