@@ -3,8 +3,9 @@
 A follower has the reference along the line, the place on it and the wheels of a motion; a steering law (pure pursuit,
 Kanayama's, a linear-quadratic regulator) says how it turns. All laws act on the centre of rotation, which moves as a
 unicycle, beside the reference motion of `Reference`; the integral is of the tracked point's distance from the line.
-Gains are what a simplex search on five training robots found; those of the regulator are chosen. `WithFallback` lets
-one take over for as long as DISCO finds nothing valid, where robot.toml asks for one.
+Gains are what a simplex search on five training robots found, at 0.2 m/s; faster robots have the same bandwidth in
+time, as their wheels change speed no sooner. Those of the regulator are chosen. `WithFallback` lets one take over for
+as long as DISCO finds nothing valid, where robot.toml asks for one.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
 
 Array = NDArray[np.float64]
 
+GAINS_SPEED_M_S = 0.2
+"""Speed at which, and below which, the gains of pure pursuit and Kanayama's law hold as they stand."""
 # Chosen: after a longer pause the integral goes on as if that much had passed.
 _LONGEST_GAP_S = 0.2
 
@@ -202,7 +205,10 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class PurePursuit:
-    """Turn towards the reference `look_ahead_m` further on (Coulter 1992), and against the integral if any."""
+    """Turn towards the reference further on (Coulter 1992), and against the integral if any.
+
+    It looks `look_ahead_m` ahead, in proportion more above 0.2 m/s.
+    """
 
     look_ahead_m: float = 0.14
     integral: float = 0.0
@@ -211,7 +217,8 @@ class PurePursuit:
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
         """Return the arc through the goal, less the reference's."""
-        goal_x, goal_y = reference.axle_m(reference.ahead(errors.place, self.look_ahead_m))
+        faster = max(reference.speed_m_s / GAINS_SPEED_M_S, 1.0)
+        goal_x, goal_y = reference.axle_m(reference.ahead(errors.place, faster * self.look_ahead_m))
         axle_x, axle_y = x_m + reference.x_icr_m * math.cos(yaw_rad), y_m + reference.x_icr_m * math.sin(yaw_rad)
         to_x, to_y = goal_x - axle_x, goal_y - axle_y
         left = to_y * math.cos(yaw_rad) - to_x * math.sin(yaw_rad)
@@ -223,7 +230,10 @@ class PurePursuit:
 
 @dataclass(frozen=True, slots=True)
 class Kanayama:
-    """omega = omega_r - v_r (left e + yaw sin e_yaw + integral of e), e to the left (Kanayama et al. 1990)."""
+    """omega = omega_r - v_r (left e + yaw sin e_yaw + integral of e), e to the left (Kanayama et al. 1990).
+
+    Above 0.2 m/s `yaw` is less in proportion to the speed, and `left` and `integral` to its square.
+    """
 
     left: float = 184.0
     yaw: float = 15.7
@@ -233,7 +243,9 @@ class Kanayama:
 
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
         """Return Kanayama's turning correction (rad/s), and the cosine of the heading error as speed factor."""
-        correction = self.left * errors.left_m + self.yaw * math.sin(errors.yaw_rad) + self.integral * errors.sum_m_s
+        slower = min(GAINS_SPEED_M_S / reference.speed_m_s, 1.0)
+        off = self.left * errors.left_m + self.integral * errors.sum_m_s
+        correction = slower * (slower * off + self.yaw * math.sin(errors.yaw_rad))
         return -reference.speed_m_s * correction, max(math.cos(errors.yaw_rad), 0.2)
 
 

@@ -5,7 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from disco_hw.control.baselines import Kanayama, LinearQuadratic, PurePursuit, Reference
+from disco_hw.control.baselines import Follower, Kanayama, LinearQuadratic, PurePursuit, Reference
+from disco_hw.control.kernel.guide import SteeredChassis
+from disco_hw.control.plan import CommandLimits, PlannerState
 from tests.tables import thinned
 from tools.foreign_plant import NOMINAL, ForeignRobot
 from tools.tracking import classical, drive, tracks
@@ -46,6 +48,37 @@ def test_every_law_follows_every_way_with_the_nominal_robot(law):
         driven = drive(classical(law), ForeignRobot(*NOMINAL), track, duration_s=20.0).after()
         assert driven.rms_mm < LARGEST_MM[type(law)]
         assert driven.speed_m_s > 0.15
+
+
+@pytest.mark.parametrize(
+    ("chassis", "radius_m", "speed_m_s", "off_m"),
+    [
+        (SteeredChassis(0.061, 0.415, 0.238, 0.0, 0.0), 1.5, 0.4, 0.1),
+        (SteeredChassis(0.15, 0.6, 0.2, 0.0, 0.0), 2.0, 0.5, 0.1),
+        (SteeredChassis(0.15, 0.6, 0.2, 0.0, 0.0), 3.0, 1.0, 0.1),
+        (SteeredChassis(0.3, 2.0, 0.8, 0.0, 0.0), 7.5, 1.0, 0.1),
+    ],
+)
+@pytest.mark.parametrize("law", [Kanayama(), PurePursuit(), LinearQuadratic()], ids=lambda law: type(law).__name__)
+def test_a_fast_or_large_robot_comes_back_to_its_circle_and_stays_there(law, chassis, radius_m, speed_m_s, off_m):
+    """Wheels that change their speed by 20 rad/s in a second, and no other lag."""
+    angle, step_s = np.linspace(0.0, 2.0 * math.pi, 721), 0.02
+    reference = Reference(radius_m * np.column_stack([np.cos(angle), np.sin(angle)]), speed_m_s, chassis.x_icr_m)
+    follower = Follower(reference, law, chassis, CommandLimits(12.0, 20.0))
+    x, y, yaw, wheels, away_m = radius_m + off_m, 0.0, float(reference.yaw_rad[0]), np.zeros(2), []
+    for k in range(round(25.0 / step_s)):
+        now_ns = round(k * step_s * 1e9)
+        command = follower.plan(now_ns, PlannerState(now_ns, x, y, yaw, *wheels)).at(now_ns)
+        wheels = wheels + np.clip(np.subtract(command, wheels), -20.0 * step_s, 20.0 * step_s)
+        forward, turn = chassis.wheel_radius_m * np.array(
+            [wheels.sum() / 2, np.diff(wheels)[0] / chassis.axial_distance_m]
+        )
+        middle = yaw + 0.5 * step_s * turn
+        x += step_s * (forward * math.cos(middle) + turn * chassis.x_icr_m * math.sin(middle))
+        y += step_s * (forward * math.sin(middle) - turn * chassis.x_icr_m * math.cos(middle))
+        yaw += step_s * turn
+        away_m.append(math.hypot(x, y) - radius_m)
+    assert np.abs(away_m[len(away_m) // 2 :]).max() < 0.03
 
 
 @pytest.mark.parametrize("x_icr_m", [0.1, -0.1])
