@@ -6,6 +6,7 @@ Each is refused in one line, at once, before a byte of it is taken in.
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import io
 import os
@@ -156,7 +157,7 @@ def parse_toml(content: bytes, name: str) -> dict[str, Any]:
     """
     try:
         # Some editors write a mark before the first line.
-        text = content.decode("utf-8-sig").replace("\r\n", "\n")
+        text = content.removeprefix(codecs.BOM_UTF8).decode("utf-8").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: not valid TOML (not UTF-8: {error.reason}); save it as UTF-8") from None
     _refuse_hostile(text, name)

@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -57,16 +58,10 @@ def test_an_input_is_not_written_over_by_whatever_name(tmp_path, file):
         refuse_file(tmp_path / "new", [tmp_path / "new"])
 
 
-def test_an_experiment_looks_at_its_directory_and_its_numbers_first(file):
-    def drive(out, duration_s=2.0, lag_s=0.1, wheel_noise=0.05):
-        circle(None, seeds=1, duration_s=duration_s, lag_s=lag_s, wheel_noise=wheel_noise, out=out)
-
-    for begin in (lambda: pendulum(seeds=1, out=file), lambda: drive(file), lambda: adapt(None, seeds=1, out=file)):
+def test_an_experiment_looks_at_its_directory_first(file):
+    for begin in (pendulum, partial(circle, None), partial(adapt, None)):
         with pytest.raises(InputError, match="exists and is not a directory"):
-            begin()
-    for option, numbers in (("duration-s", {"duration_s": math.inf}), ("lag-s", {"lag_s": math.inf})):
-        with pytest.raises(InputError, match=f"--{option} inf: not a finite number"):
-            drive(file.parent / "out", **numbers)
+            begin(seeds=1, out=file)
 
 
 def test_what_is_no_number_is_null(capsys):
