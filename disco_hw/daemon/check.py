@@ -53,6 +53,8 @@ from firmware_protocol.codec import Codec, Decoded
 
 # Chosen: longer than a link takes to open; then the check says that it does not.
 _LINK_TIMEOUT_S = 2.0
+# Three periods of the reference protocol's HOST_STATE, and more commands of a host that drives.
+_OTHER_HOST_S = 0.3
 # Above _SETTLED_S, so that half of it counts; three of what comes once a second.
 _LISTEN_S = 3.0
 # By then the handshake is over: what the robot rejects from now on it would reject while driving.
@@ -86,7 +88,8 @@ class CheckReport:
 def run_check(robot: Path, link: str | None = None) -> CheckReport:
     """Check files, link, firmware, timing and this computer; takes about three seconds.
 
-    Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
+    Raises InputError if a file is wrong, WorkError while a daemon or another host drives this robot: the two would
+    speak at once.
     """
     setup = load_setup(robot, None, link)
     key, transport = link_key(setup), create_link(setup)
@@ -105,6 +108,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
+            refuse_other_host(transport, driver_of(setup.config, key))
             found = _query_robot(transport, driver_of(setup.config, key), pose_source)
             checks.append(_firmware_check(found, kind.reports_reception))
             if kind.reports_reception:
@@ -154,6 +158,24 @@ def refuse_while_daemon_runs(config: RobotConfig) -> None:
     raise WorkError(
         f"{path}: a daemon is connected to this robot; see `disco-hw ctl ROBOT.toml status`, or stop the daemon first"
     )
+
+
+def refuse_other_host(transport: Transport, driver: Driver) -> None:
+    """Listen on the link for 0.3 s without sending; raise WorkError if another host speaks on it.
+
+    A daemon of another user, such as the service, has its control socket where this user does not look. `driver`: one
+    for this alone.
+    """
+    start_ns = time.monotonic_ns()
+    driver.link_up(start_ns)
+    while (now_ns := time.monotonic_ns()) < start_ns + _OTHER_HOST_S * 1e9:
+        other_host = driver.receive(now_ns, transport.receive()).other_host
+        if other_host is not None:
+            raise WorkError(
+                f"another host speaks on this link: {other_host}; stop it first: a daemon (with "
+                "`sudo systemctl stop disco-hw@NAME` if it is the service), or a program of the vendor's"
+            )
+        time.sleep(_STEP_S)
 
 
 def _model_check(setup: Setup) -> Check:

@@ -30,6 +30,7 @@ from disco_hw.adaptation.guard import AdaptationChoice, check_adaptable, choose_
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import PLANNER_VERSION, Law
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
+from disco_hw.daemon.check import refuse_other_host
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Report
 from disco_hw.daemon.loop import MonotonicClock
@@ -172,6 +173,7 @@ def serve(
                 report("control socket", line)
             transport.open()
             stop.add("link", transport.close)
+            refuse_other_host(transport, driver_of(config, key))
             driver = driver_of(config, key)
             core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
             core.announce = recorder.announce
