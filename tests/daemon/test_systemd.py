@@ -110,6 +110,9 @@ def test_the_unit_restarts_watches_stops_and_does_not_arm():
         ("WatchdogSec", "1"),
         ("Restart", "on-failure"),
         ("RestartPreventExitStatus", "2"),
+        # Poses and obstacles may come in by an address that is up only then.
+        ("Wants", "network-online.target"),
+        ("After", "network-online.target"),
         ("ExecStart", "/opt/disco-hw/.venv/bin/disco-hw run /etc/disco-hw/%i.toml"),
         ("ExecStopPost", "/opt/disco-hw/.venv/bin/disco-hw estop /etc/disco-hw/%i.toml"),
         ("LimitRTPRIO", "99"),
