@@ -20,6 +20,7 @@ from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo
 from disco_hw.runtime import connection
 from disco_hw.runtime.assembly import create_link, driver_of, pose_source_of
+from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -33,7 +34,7 @@ from disco_hw.runtime.preflight import (
     check_task,
     check_watchdog,
 )
-from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
+from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
 from disco_hw.runtime.supervisor import FIND_HEADING
 from drivers.motor import find_driver
 from drivers.types import (
@@ -88,8 +89,8 @@ class CheckReport:
 def run_check(robot: Path, link: str | None = None) -> CheckReport:
     """Check files, link, firmware, timing and this computer; takes about three seconds.
 
-    Raises InputError if a file is wrong, WorkError while a daemon or another host drives this robot: the two would
-    speak at once.
+    Raises InputError if a file is wrong, WorkError while a daemon or another host drives this robot, as the two would
+    speak at once, and where the system refuses a port that `run` would open.
     """
     setup = load_setup(robot, None, link)
     key, transport = link_key(setup), create_link(setup)
@@ -103,6 +104,9 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     named = setup.config.link
     kind = find_driver(named.driver)
     checks += check_safety(setup.config.robot, kind.safety_card(named.settings()))
+    obstacle_source = obstacle_source_of(setup.config)
+    if obstacle_source is not None:
+        obstacle_source.close()
     pose_source = pose_source_of(setup.config)
     transport.open()
     try:
@@ -179,13 +183,17 @@ def refuse_other_host(transport: Transport, driver: Driver) -> None:
 
 
 def _model_check(setup: Setup) -> Check:
-    """Report the model file and its effects; warn if the robot has none."""
+    """Report the model file and its effects; warn if the robot has none, fail if `run` refuses it."""
     if setup.model_file is None:
         text = (
             "no model file is named: plans use the nominal geometry and the whole prior, and the robot may drive "
             "at half the task's speed; write a model from a log with `disco-hw infer`"
         )
         return Check("model", Level.WARNING, text)
+    try:
+        refuse_missing_effects(setup)
+    except InputError as error:
+        return Check("model", Level.FAIL, str(error))
     effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
     return Check("model", Level.OK, f"{setup.model_file}, effects: {effects}")
 

@@ -1,6 +1,7 @@
 """What `check` concludes from what a robot says; the verb as a whole is tested in tests/hil."""
 
 import math
+import socket
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -23,7 +24,7 @@ from firmware_protocol.status_codes import FAULTS
 from tests.daemon.control_daemon import ControlDaemon
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot
-from tests.runtime.simulated import ROBOT_FILE
+from tests.runtime.simulated import ROBOT_FILE, robot_toml
 
 KEY = bytes(range(16))
 MS_NS = 1_000_000
@@ -177,6 +178,23 @@ def test_nothing_is_sent_on_a_link_on_which_another_host_speaks(monkeypatch, tmp
     with pytest.raises(WorkError, match=refusal):
         run.serve(load_setup(ROBOT_FILE), None, lambda topic, text: None, TaskPilot())
     assert not link.sent
+
+
+def test_a_model_that_run_refuses_fails():
+    setup = load_setup(ROBOT_FILE)
+    assert check._model_check(setup).level is Level.OK
+    lacking = replace(setup, model=replace(setup.model, missing_effects=("deadband",)))
+    reported = check._model_check(lacking)
+    assert reported.level is Level.FAIL
+    assert "the model lacks deadband" in reported.text
+
+
+def test_a_port_for_obstacles_that_run_could_not_open_is_refused(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        file = robot_toml(tmp_path, f"[fence]\nobstacles_port = {holder.getsockname()[1]}\n")
+        with pytest.raises(WorkError, match=r"fence\.obstacles_port: .*: Address already in use"):
+            check.run_check(file)
 
 
 def test_a_socket_that_cannot_be_looked_at_is_one_line():
