@@ -104,7 +104,10 @@ class RobotLinkHealth(msgspec.Struct, frozen=True, gc=False):
 
 
 class Readings(msgspec.Struct, frozen=True, gc=False):
-    """Readings from one batch of received frames, oldest first."""
+    """Readings from one batch of received frames, oldest first.
+
+    `other_host`: what another host does on the link, such as "it sends HOST_STATE"; None while none was noticed.
+    """
 
     wheels: tuple[WheelSample, ...] = ()
     poses: tuple[PoseSample, ...] = ()
@@ -113,3 +116,4 @@ class Readings(msgspec.Struct, frozen=True, gc=False):
     status: tuple[RobotStatus, ...] = ()
     link_health: tuple[RobotLinkHealth, ...] = ()
     events: tuple[str, ...] = ()
+    other_host: str | None = None

@@ -20,6 +20,7 @@ from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo
 from disco_hw.runtime import connection
 from disco_hw.runtime.assembly import create_link, driver_of, pose_source_of
+from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -33,7 +34,7 @@ from disco_hw.runtime.preflight import (
     check_task,
     check_watchdog,
 )
-from disco_hw.runtime.robot_setup import Setup, link_key, load_setup
+from disco_hw.runtime.robot_setup import Setup, link_key, load_setup, refuse_missing_effects
 from disco_hw.runtime.supervisor import FIND_HEADING
 from drivers.motor import find_driver
 from drivers.types import (
@@ -53,6 +54,8 @@ from firmware_protocol.codec import Codec, Decoded
 
 # Chosen: longer than a link takes to open; then the check says that it does not.
 _LINK_TIMEOUT_S = 2.0
+# Three periods of the reference protocol's HOST_STATE, and more commands of a host that drives.
+_OTHER_HOST_S = 0.3
 # Above _SETTLED_S, so that half of it counts; three of what comes once a second.
 _LISTEN_S = 3.0
 # By then the handshake is over: what the robot rejects from now on it would reject while driving.
@@ -86,7 +89,8 @@ class CheckReport:
 def run_check(robot: Path, link: str | None = None) -> CheckReport:
     """Check files, link, firmware, timing and this computer; takes about three seconds.
 
-    Raises InputError if a file is wrong, WorkError while a daemon drives this robot: the two would speak at once.
+    Raises InputError if a file is wrong, WorkError while a daemon or another host drives this robot, as the two would
+    speak at once, and where the system refuses a port that `run` would open.
     """
     setup = load_setup(robot, None, link)
     key, transport = link_key(setup), create_link(setup)
@@ -100,11 +104,15 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     named = setup.config.link
     kind = find_driver(named.driver)
     checks += check_safety(setup.config.robot, kind.safety_card(named.settings()))
+    obstacle_source = obstacle_source_of(setup.config)
+    if obstacle_source is not None:
+        obstacle_source.close()
     pose_source = pose_source_of(setup.config)
     transport.open()
     try:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
+            refuse_other_host(transport, driver_of(setup.config, key))
             found = _query_robot(transport, driver_of(setup.config, key), pose_source)
             checks.append(_firmware_check(found, kind.reports_reception))
             if kind.reports_reception:
@@ -156,14 +164,36 @@ def refuse_while_daemon_runs(config: RobotConfig) -> None:
     )
 
 
+def refuse_other_host(transport: Transport, driver: Driver) -> None:
+    """Listen on the link for 0.3 s without sending; raise WorkError if another host speaks on it.
+
+    A daemon of another user, such as the service, has its control socket where this user does not look. `driver`: one
+    for this alone.
+    """
+    start_ns = time.monotonic_ns()
+    driver.link_up(start_ns)
+    while (now_ns := time.monotonic_ns()) < start_ns + _OTHER_HOST_S * 1e9:
+        other_host = driver.receive(now_ns, transport.receive()).other_host
+        if other_host is not None:
+            raise WorkError(
+                f"another host speaks on this link: {other_host}; stop it first: a daemon (with "
+                "`sudo systemctl stop disco-hw@NAME` if it is the service), or a program of the vendor's"
+            )
+        time.sleep(_STEP_S)
+
+
 def _model_check(setup: Setup) -> Check:
-    """Report the model file and its effects; warn if the robot has none."""
+    """Report the model file and its effects; warn if the robot has none, fail if `run` refuses it."""
     if setup.model_file is None:
         text = (
             "no model file is named: plans use the nominal geometry and the whole prior, and the robot may drive "
             "at half the task's speed; write a model from a log with `disco-hw infer`"
         )
         return Check("model", Level.WARNING, text)
+    try:
+        refuse_missing_effects(setup)
+    except InputError as error:
+        return Check("model", Level.FAIL, str(error))
     effects = ", ".join(effect.name for effect in setup.model.effects) or "none"
     return Check("model", Level.OK, f"{setup.model_file}, effects: {effects}")
 

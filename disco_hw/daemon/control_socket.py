@@ -75,6 +75,7 @@ class ControlServer:
         self._allowed_uids = frozenset({os.geteuid(), 0} if allowed_uids is None else allowed_uids)
         self._clients: dict[int, _Client] = {}
         self._activity = 0
+        self._failure = ""
         _create_private_directory(path.parent)
         self._lock_fd = _lock(path)
         try:
@@ -82,6 +83,7 @@ class ControlServer:
         except BaseException:
             os.close(self._lock_fd)
             raise
+        self._bound = _identity(path)
 
     def poll(self) -> list[ControlMessage]:
         """Accept, read and send what is possible at once; return the requests to act on, e-stops first.
@@ -112,13 +114,38 @@ class ControlServer:
             client.outgoing += msgspec.json.encode({"do": message.action, **body}) + b"\n"
             self._send(message.client, client)
 
+    def restore(self) -> str | None:
+        """Make directory, lock and socket again where they were removed; return what happened, if that is new.
+
+        Systemd removes a user's runtime directory at the last logout, and others clean /tmp: a daemon that lives on
+        could not be reached any more, and a second one could start.
+        """
+        # The lock counts as held on its file alone. Where that is there it is not opened: closing it would unlock it.
+        has_lock = _identity(_lock_path(self.path)) == _identity(self._lock_fd)
+        if has_lock and _identity(self.path) == self._bound:
+            return None
+        try:
+            _create_private_directory(self.path.parent)
+            if not has_lock:
+                lock_fd = _lock(self.path)
+                os.close(self._lock_fd)
+                self._lock_fd = lock_fd
+            listener = _listen(self.path)
+        except (InputError, OSError) as error:
+            is_known, self._failure = str(error) == self._failure, str(error)
+            return None if is_known else f"{self.path}: was removed, and cannot be made again: {error}"
+        self._listener.close()
+        self._listener, self._bound, self._failure = listener, _identity(self.path), ""
+        return f"{self.path}: was removed, and is made again; see `loginctl enable-linger`"
+
     def close(self) -> None:
-        """Disconnect all clients and remove the socket; safe to call twice."""
+        """Disconnect all clients and remove the socket, if it is still this one's; safe to call twice."""
         for number in list(self._clients):
             self._drop(number)
         if self._listener.fileno() != -1:
+            if _identity(self.path) == self._bound:
+                self.path.unlink(missing_ok=True)
             self._listener.close()
-            self.path.unlink(missing_ok=True)
             # The lock's file stays: removing it would let a third process lock a new file while a second holds this.
             os.close(self._lock_fd)
 
@@ -214,9 +241,23 @@ def _create_private_directory(directory: Path) -> None:
         raise InputError(f"{directory}: {why}; {HINT}")
 
 
+def _identity(file: Path | int) -> tuple[int, int] | None:
+    """Return device and inode of a path or a descriptor; None where nothing is there."""
+    try:
+        found = os.stat(file)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _lock_path(path: Path) -> Path:
+    """Return the lock file of the socket at `path`."""
+    return path.with_name(path.name + ".lock")
+
+
 def _lock(path: Path) -> int:
-    """Return the descriptor of the socket's lock file, locked and holding this process's id."""
-    lock_path = path.with_name(path.name + ".lock")
+    """Return the descriptor of the socket's lock file, locked; it holds this process's id, where there is room."""
+    lock_path = _lock_path(path)
     try:
         descriptor = os.open(lock_path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
     except OSError as error:
@@ -228,8 +269,9 @@ def _lock(path: Path) -> int:
         owner = os.read(descriptor, 32).decode(errors="replace").strip() or "unknown"
         os.close(descriptor)
         raise InputError(f"{path}: a daemon already serves this socket (process {owner}); stop it first") from None
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
+    with contextlib.suppress(OSError):
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
     return descriptor
 
 

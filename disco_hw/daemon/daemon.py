@@ -254,7 +254,12 @@ class Daemon:
         if last is not None:
             self._report_state(last)
         stolen_ms = processes.stolen_ms() - self._stolen_before_ms
-        return (counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms),)
+        counted = counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms)
+        restored = self._server.restore()
+        if restored is None:
+            return (counted,)
+        self._report("control socket", restored)
+        return counted, records.Event(now_ns, "warning", "control socket", restored)
 
     def _report_state(self, last: CoreTick) -> None:
         """Say how things are and what to do, to the service manager and to whoever reads the output."""

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,12 +31,13 @@ from disco_hw.adaptation.guard import AdaptationChoice, check_adaptable, choose_
 from disco_hw.config import RobotConfig
 from disco_hw.control.plan import PLANNER_VERSION, Law
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
+from disco_hw.daemon.check import refuse_other_host
 from disco_hw.daemon.control_socket import ControlServer
 from disco_hw.daemon.daemon import Daemon, Report
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
 from disco_hw.daemon.process import STANDARD_OUTPUT, AsyncPrinter, StopPath, StopSignals
-from disco_hw.errors import InputError, LogError
+from disco_hw.errors import InputError, LogError, WorkError
 from disco_hw.files import check_log_file, file_name_of
 from disco_hw.log import DBC, Attachment, version
 from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
@@ -83,7 +85,7 @@ def run_robot(
 
     `law(state, task, model)` gives wheel speeds, left and right (rad/s), once a control period; the other arguments are
     those of `disco-hw run`. Returns after Ctrl-C, SIGTERM or `disco-hw ctl ROBOT.toml quit`, after a stop was
-    sent to the robot. Call it in the main thread, as it catches signals. Raises InputError.
+    sent to the robot. Call it in the main thread, as it catches signals. Raises InputError and WorkError.
     """
     processes.spare_memory()
     options = DaemonOptions(
@@ -102,8 +104,8 @@ def run_daemon(
 
     `create_pilot`: of who drives; the task alone, unless it is said. `law`: plans in DISCO's place. `page_messages`:
     what happened to the page, to be recorded.
-    Raises InputError, before anything is opened, if a file or an option is wrong. An exception in the loop is reported,
-    the robot stopped, and the exception passed on.
+    Raises InputError, before anything is opened, if a file or an option is wrong, and what `serve` raises. An exception
+    in the loop is reported, the robot stopped, and the exception passed on.
     """
     check_log_file(options.log_file)
     setup = load_setup(options.robot, options.model, options.link)
@@ -143,7 +145,8 @@ def serve(
     `report` is called in the loop, and so must not wait. `pilot` decides what the robot does while motion is allowed;
     `new_planner` is called twice, as one planner is used up in the warm-up. `adapts`: whether the geometry is learnt
     while driving; not where an operator drives. `advice_style`: how the operator requests the next step; with it
-    the daemon reports what it waits for, what to do, and where the log is. Raises InputError.
+    the daemon reports what it waits for, what to do, and where the log is. Raises InputError, and WorkError for what
+    the system refuses now and may grant at another start: a port, an address, a log.
     """
     config, key, transport = setup.config, link_key(setup), create_link(setup)
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
@@ -172,6 +175,7 @@ def serve(
                 report("control socket", line)
             transport.open()
             stop.add("link", transport.close)
+            refuse_other_host(transport, driver_of(config, key))
             driver = driver_of(config, key)
             core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
             core.announce = recorder.announce
@@ -204,10 +208,16 @@ def _progress(text: str) -> None:
         print(text, file=sys.stderr, flush=True)
 
 
-def new_log(config: RobotConfig, what: str = "") -> Path:
-    """Return the path of a new log: the directory of [log], the name of the robot, what is recorded, the time (UTC)."""
+def new_log(config: RobotConfig, what: str = "", directory: Path | None = None) -> Path:
+    """Return the path of a new log: the directory of [log], the name of the robot, what is recorded, the time (UTC).
+
+    Without a real-time clock the same second can come again after a power cut: then a number follows. `directory`: in
+    place of that of [log].
+    """
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
-    return Path(config.log.directory) / f"{file_name_of(config.robot.name)}-{what}{stamp}.mcap"
+    first = (directory or Path(config.log.directory)) / f"{file_name_of(config.robot.name)}-{what}{stamp}.mcap"
+    later = (first.with_stem(f"{first.stem}-{number}") for number in count(2))
+    return next(path for path in chain((first,), later) if not os.path.lexists(path))
 
 
 def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
@@ -216,9 +226,12 @@ def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
     attachments = [*kept_files(setup), Attachment(DBC, "text/plain", packaged_dbc().encode())]
     name = setup.config.robot.name
     scene = scene_of(setup.config)
-    return ProcessRecorder(
-        RecordingSettings(log, name, version(), PLANNER_VERSION, attachments=tuple(attachments), scene=scene)
-    )
+    recording = RecordingSettings(log, name, version(), PLANNER_VERSION, attachments=tuple(attachments), scene=scene)
+    try:
+        return ProcessRecorder(recording)
+    except LogError as error:
+        # No wrong file or option: a disk that is full now may have room at the next start.
+        raise WorkError(str(error)) from None
 
 
 def _close_recorder(recorder: Recorder, report: Report) -> None:

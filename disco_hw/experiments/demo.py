@@ -7,10 +7,8 @@ simulator's truth afterwards. Nothing here reaches into either process.
 from __future__ import annotations
 
 import math
-import os
 import shlex
 import signal
-import socket
 import tempfile
 import threading
 import time
@@ -32,6 +30,7 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments import (
     DEVICES,
     READY_TIMEOUT_S,
+    Child,
     Operator,
     disco_hw_process,
     is_stationary,
@@ -50,7 +49,7 @@ from disco_hw.fence import Circle, Footprint
 from disco_hw.processes import stolen_ms
 from disco_hw.runtime.robot_setup import Setup, geometry, load_setup
 from disco_hw.tasks.circle import CircleTask, circle_task, inwards_sine
-from disco_hw.viewer import DEFAULT_PORT, LOOPBACK, TOKEN_VARIABLE, page_address, page_token
+from disco_hw.viewer import DEFAULT_PORT, page_token
 
 # Chosen: how often the picture in the terminal is drawn.
 _POLL_S = 0.1
@@ -121,6 +120,9 @@ def run_demo(options: DemoOptions) -> CircleReport:
         raise InputError(
             f"--link {options.link}: cannot be used with --device, which sets its own link; leave --link out"
         )
+    if options.view:
+        # A wrong one in the environment is refused before anything is started.
+        page_token()
     options.out.mkdir(parents=True, exist_ok=True)
     console = Console(stderr=not options.show_progress)
     with _ended_by_signals(), tempfile.TemporaryDirectory(prefix="disco-hw-demo-") as scratch:
@@ -237,8 +239,6 @@ def _drive(options: DemoOptions, robot_file: Path, console: Console) -> bool:
         "sim", str(robot_file), "--plant-seed", str(options.plant_seed), "--truth", str(truth),
         "--start", *map(str, start_pose(setup)),
     ]  # fmt: skip
-    # The daemon hands the variable on to its page.
-    os.environ[TOKEN_VARIABLE] = token = page_token()
     daemon_arguments = ["run", str(robot_file), "--log", str(log)]
     daemon_arguments += ["--view", "--port", str(options.port)] if options.view else []
     daemon_arguments += ["--adapt"] if options.adapt else []
@@ -251,9 +251,7 @@ def _drive(options: DemoOptions, robot_file: Path, console: Console) -> bool:
         console.print(f"virtual robot pid {robot.process.pid}, daemon pid {daemon.process.pid}, link {link}")
         if options.view:
             operator.wait_for("READY", READY_TIMEOUT_S)
-            _wait_for_page(options.port)
-            address = page_address(LOOPBACK, options.port, token)
-            console.print(f"page {address} (until the drive is over)", soft_wrap=True)
+            console.print(page_line(daemon), soft_wrap=True, markup=False)
         operator.arm()
         if options.obstacle:
             (x_m, y_m), radius_m = PILLAR.center, PILLAR.radius_m
@@ -271,16 +269,21 @@ def _drive(options: DemoOptions, robot_file: Path, console: Console) -> bool:
     return stopped
 
 
-def _wait_for_page(port: int) -> None:
-    """Return once the page answers, so that nobody opens it in vain, or after some seconds: the drive needs no page."""
+def page_line(daemon: Child) -> str:
+    """Return the line about the page for the operator: its address, or why there is none.
+
+    Another program may listen on the port, so that the page's own word counts. It is waited for some seconds: the drive
+    needs no page.
+    """
     deadline_s = time.monotonic() + _PAGE_TIMEOUT_S
     while time.monotonic() < deadline_s:
-        try:
-            socket.create_connection((LOOPBACK, port), _POLL_S).close()
-        except OSError:
-            time.sleep(_POLL_S)
-        else:
-            return
+        for line in daemon.output_lines().splitlines(keepends=True):
+            if line.startswith("page: http") and line.endswith("\n"):
+                return f"page {line.removeprefix('page: ').strip()} (until the drive is over)"
+            if line.startswith("page: ") and line.endswith("\n"):
+                return line.strip()
+        time.sleep(_POLL_S)
+    return f"page: no address in {daemon.output} after {_PAGE_TIMEOUT_S:g} s"
 
 
 def _watch_laps(operator: Operator, options: DemoOptions, limit_s: float, console: Console) -> None:

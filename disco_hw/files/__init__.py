@@ -74,9 +74,13 @@ def control_character_in(text: str) -> str | None:
 
 
 def check_log_file(log_file: Path | None) -> None:
-    """Raise InputError if the name given with --log cannot stand in one line of a message."""
-    if log_file is not None and (fault := control_character_in(str(log_file))):
+    """Raise InputError if the name given with --log cannot stand in one line of a message, or is taken."""
+    if log_file is None:
+        return
+    if fault := control_character_in(str(log_file)):
         raise InputError(f"--log {str(log_file)!a}: {fault}; give another name")
+    if os.path.lexists(log_file):
+        raise InputError(f"--log {log_file}: already exists; give another name")
 
 
 def open_file(path: Path, kind: FileKind) -> int:

@@ -197,8 +197,7 @@ def write_fields(
 
 def _drive(stage: GuidedStage, setup: Setup, options: CommissionOptions) -> Any:
     """One drive through the daemon; what its procedure returned. Raises WorkError if the person gave up."""
-    log = new_log(setup.config, f"commission-{stage.name}-")
-    log = (options.log_directory or log.parent) / log.name
+    log = new_log(setup.config, f"commission-{stage.name}-", options.log_directory)
     keyboard = Keyboard(STANDARD_INPUT, KeyHold(0.0), MonotonicClock())
     procedure = Procedure(stage.steps(setup.config.robot, setup.config.slowest_wheel_rad_s))
     pilot = CommissionPilot(procedure, keyboard, keyboard.typed, lambda: keyboard.is_ignored)

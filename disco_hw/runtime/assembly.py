@@ -24,7 +24,7 @@ from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.past_motion import DriveMeans
 from disco_hw.control.plan import Law, LawController
 from disco_hw.control.surroundings import Surroundings
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation import PoseFusion
 from disco_hw.estimation.filter import TAKE_OVER_TIMEOUTS
 from disco_hw.estimation.heading_watch import HeadingWatch
@@ -203,7 +203,10 @@ def assemble_core(
 
 
 def pose_source_of(config: RobotConfig) -> PoseSource:
-    """Return the pose source that robot.toml names, or those. Raises InputError for one that cannot be had."""
+    """Return the pose source that robot.toml names, or those.
+
+    Raises InputError for one that cannot be had, WorkError where the system refuses its port, address or device now.
+    """
     opened: list[PoseSource] = []
     # By then the task has stopped for want of poses: another sender never takes over while it runs.
     silence_s = TAKE_OVER_TIMEOUTS * config.estimation.pose_timeout_s
@@ -216,7 +219,10 @@ def pose_source_of(config: RobotConfig) -> PoseSource:
             for one in opened:
                 one.close()
             which = "" if named is config.pose else f" {label}"
-            raise InputError(f"robot.toml: pose.source{which}: {error}") from None
+            text = f"robot.toml: pose.source{which}: {error}"
+            # What the system refuses while the network comes up it may grant at the next start.
+            is_refused_now = isinstance(error, PoseSourceError) and isinstance(error.__context__, OSError)
+            raise (WorkError if is_refused_now else InputError)(text) from None
         opened.append(converted(source, named.convention()))
     return opened[0] if len(opened) == 1 else SeveralPoses(opened, config.pose.labels())
 

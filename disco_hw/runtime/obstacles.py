@@ -20,7 +20,7 @@ import msgspec
 from msgspec import Meta
 
 from disco_hw.config import RobotConfig
-from disco_hw.errors import InputError
+from disco_hw.errors import WorkError
 from disco_hw.fence.clearance import MovingCircle
 from drivers.pose.senders import RefusedDatagrams
 from drivers.pose.udp import open_udp_port
@@ -154,7 +154,7 @@ _MESSAGE_PACK = msgspec.msgpack.Decoder(_Content)
 
 
 def obstacle_source_of(config: RobotConfig) -> UdpObstacles | None:
-    """Open the port that robot.toml names for reports; None without one. Raises InputError if it cannot be had."""
+    """Open the port that robot.toml names for reports; None without one. Raises WorkError if it cannot be had."""
     port = config.fence.obstacles_port
     if port is None:
         return None
@@ -163,7 +163,7 @@ def obstacle_source_of(config: RobotConfig) -> UdpObstacles | None:
         return UdpObstacles(open_udp_port(address, port))
     except OSError as error:
         why = error.strerror or str(error)
-        raise InputError(f"robot.toml: fence.obstacles_port: {address}:{port}: {why}; choose another port") from None
+        raise WorkError(f"robot.toml: fence.obstacles_port: {address}:{port}: {why}; choose another port") from None
 
 
 class UdpObstacles:

@@ -14,6 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from disco_hw.errors import InputError
+
 LOOPBACK = "127.0.0.1"
 # Chosen: the usual port of a web server that needs no rights.
 DEFAULT_PORT = 8080
@@ -141,14 +143,14 @@ def _token_or_given() -> str:
     """Return a token for the page; one that the environment gives wrongly stays as it is, and the page refuses it."""
     try:
         return page_token()
-    except ValueError:
+    except InputError:
         return os.environ[TOKEN_VARIABLE]
 
 
 def page_token() -> str:
     """Return the token of the page about to start: what $DISCO_HW_PAGE_TOKEN says, else one that nobody can guess.
 
-    In a variable, and not in an argument, as other users can read the arguments of a process. Raises ValueError for
+    In a variable, and not in an argument, as other users can read the arguments of a process. Raises InputError for
     one of less than 16 characters or with others than letters, digits, - and _.
     """
     given = os.environ.get(TOKEN_VARIABLE)
@@ -157,7 +159,7 @@ def page_token() -> str:
 
         return secrets.token_urlsafe(16)
     if len(given) < _SHORTEST or not given.replace("-", "").replace("_", "").isalnum() or not given.isascii():
-        raise ValueError(f"{TOKEN_VARIABLE}: give {_SHORTEST} or more letters, digits, - and _, or unset it")
+        raise InputError(f"{TOKEN_VARIABLE}: give {_SHORTEST} or more letters, digits, - and _, or unset it")
     return given
 
 

@@ -113,10 +113,7 @@ def serving(label: str, host: str = LOOPBACK, port: int = DEFAULT_PORT, desk: De
     The address carries the page's token. Raises InputError if the port is taken, the host is none of this machine's, or
     the token of the environment is none.
     """
-    try:
-        guard = Guard(page_token(), local=host == LOOPBACK)
-    except ValueError as error:
-        raise InputError(str(error)) from None
+    guard = Guard(page_token(), local=host == LOOPBACK)
     admission = Admission()
     listener = PacedListener(_listen(host, port), admission)
     with _guarded(guard, desk, listener, admission), redirect_stdout(io.StringIO()):

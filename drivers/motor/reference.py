@@ -241,11 +241,13 @@ class ReferenceDriver:
                     collected.setdefault(kind, []).append(sample)
         self._check_liveness(now_ns)
         self._report_outside_stop(stopped_ns)
-        if self._reception.foreign is not None and not self._foreign_reported:
+        other_host = None if self._reception.foreign is None else f"it sends {self._reception.foreign}"
+        if other_host is not None and not self._foreign_reported:
             self._foreign_reported = True
-            self._events.append(f"another host is on the link: it sends {self._reception.foreign}; disconnect it")
+            self._events.append(f"another host is on the link: {other_host}; disconnect it")
         events, self._events = tuple(self._events), []
-        return Readings(**{kind: tuple(samples) for kind, samples in collected.items()}, events=events)
+        samples_by_kind = {kind: tuple(samples) for kind, samples in collected.items()}
+        return Readings(**samples_by_kind, events=events, other_host=other_host)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
         """Return the frames due now: the command (only while armed; zeros while arming) and house-keeping.

@@ -269,9 +269,12 @@ class VendorDriver:
         """Take in received frames and return what they meant; frames that come while the link is down are ignored."""
         wheels: list[WheelSample] = []
         status: RobotStatus | None = None
+        other_host: str | None = None
         for received in frames if self._permit.link_is_up else ():
             report = self._port.handle(received, self._permit)
             self._react(report)
+            if report.commanded is not None:
+                other_host = f"it commands {report.commanded}"
             if report.is_status:
                 status = parts.status(received.t_ns, self.state, self._port.is_stopped)
             if report.wheels is not None:
@@ -281,7 +284,8 @@ class VendorDriver:
             self._check_silence(now_ns)
             self._check_objection()
         events, self._permit = self._permit.events, replace(self._permit, events=())
-        return Readings(wheels=tuple(wheels), status=() if status is None else (status,), events=events)
+        statuses = () if status is None else (status,)
+        return Readings(wheels=tuple(wheels), status=statuses, events=events, other_host=other_host)
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
         """Return the frames due now: the command or a stop, and the questions.

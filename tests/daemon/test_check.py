@@ -1,6 +1,7 @@
 """What `check` concludes from what a robot says; the verb as a whole is tested in tests/hil."""
 
 import math
+import socket
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -9,19 +10,21 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from disco_hw.daemon import check
-from disco_hw.errors import InputError
+from disco_hw.daemon import check, run
+from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.core import TaskPilot
 from disco_hw.runtime.preflight import Level
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import create_driver
 from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
-from drivers.types import Frame, OutgoingFrame, PoseSample
+from drivers.types import Frame, LinkState, OutgoingFrame, PoseSample, ReceivedFrame
+from firmware_protocol.codec import Codec
 from firmware_protocol.status_codes import FAULTS
 from tests.daemon.control_daemon import ControlDaemon
 from tests.drivers.motor.reference_robot import CONFIG, ReferenceRobot
 from tests.robot import test_robot
-from tests.runtime.simulated import ROBOT_FILE
+from tests.runtime.simulated import ROBOT_FILE, robot_toml
 
 KEY = bytes(range(16))
 MS_NS = 1_000_000
@@ -136,6 +139,62 @@ def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):
     ):
         test_robot.TestRobot.create_end(SimpleNamespace(getoption=lambda _: str(robot)))
     assert caught.value.returncode == 1
+
+
+class SharedLink:
+    """A link that is up, on which another host says that it is there; nothing can be sent on it."""
+
+    name, state, last_error = "can0", LinkState.UP, None
+
+    def __init__(self):
+        self.sent = []
+
+    def open(self):
+        pass
+
+    def close(self):
+        pass
+
+    def send(self, outgoing, now_ns):
+        self.sent.append(outgoing)
+        return True
+
+    def receive(self):
+        state = Codec().encode("HOST_STATE", 0, request="STANDBY", session=0, challenge_answer=0, host_fault=0)
+        return (ReceivedFrame(time.monotonic_ns(), Frame(*state)),)
+
+
+def test_nothing_is_sent_on_a_link_on_which_another_host_speaks(monkeypatch, tmp_path):
+    """The service's daemon has its control socket where another user does not look."""
+    link = SharedLink()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(check, "create_link", lambda _: link)
+    monkeypatch.setattr(run, "create_link", lambda _: link)
+    monkeypatch.setattr(run.processes, "enter_real_time", lambda _: ())
+    refusal = "another host speaks on this link: it sends HOST_STATE; stop it first"
+    with pytest.raises(WorkError, match=refusal):
+        check.run_check(ROBOT_FILE)
+    with pytest.raises(WorkError, match=refusal):
+        run.serve(load_setup(ROBOT_FILE), None, lambda topic, text: None, TaskPilot())
+    assert not link.sent
+
+
+def test_a_model_that_run_refuses_fails():
+    setup = load_setup(ROBOT_FILE)
+    assert check._model_check(setup).level is Level.OK
+    lacking = replace(setup, model=replace(setup.model, missing_effects=("deadband",)))
+    reported = check._model_check(lacking)
+    assert reported.level is Level.FAIL
+    assert "the model lacks deadband" in reported.text
+
+
+def test_a_port_for_obstacles_that_run_could_not_open_is_refused(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        file = robot_toml(tmp_path, f"[fence]\nobstacles_port = {holder.getsockname()[1]}\n")
+        with pytest.raises(WorkError, match=r"fence\.obstacles_port: .*: Address already in use"):
+            check.run_check(file)
 
 
 def test_a_socket_that_cannot_be_looked_at_is_one_line():

@@ -1,5 +1,6 @@
 import json
 import os
+import shutil
 import signal
 import socket
 import stat
@@ -374,6 +375,59 @@ def test_a_closed_server_leaves_no_socket_and_can_be_closed_twice(tmp_path):
         server.close()
         server.close()
         assert not path.exists()
+
+
+def is_refused_elsewhere(path):
+    """Whether a daemon of another process is refused at this path: the lock is no bar to the same process."""
+    child = os.fork()
+    if child == 0:
+        try:
+            ControlServer(path, ACTIONS)
+        except InputError:
+            os._exit(7)
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+
+
+@pytest.mark.parametrize("removed", ["directory", "socket", "lock"])
+def test_a_socket_that_was_removed_is_made_again_and_keeps_other_daemons_out(tmp_path, removed):
+    """As at the last logout, which removes /run/user/UID, or by what cleans /tmp."""
+    with served(tmp_path) as server, connect(server) as before:
+        server.poll()
+        assert server.restore() is None
+        if removed == "directory":
+            shutil.rmtree(server.path.parent)
+        else:
+            server.path.with_name(server.path.name + (".lock" if removed == "lock" else "")).unlink()
+        assert server.restore() == f"{server.path}: was removed, and is made again; see `loginctl enable-linger`"
+        assert server.restore() is None
+        assert is_refused_elsewhere(server.path)
+        assert_takes_an_estop(server)
+        send(before, {"do": "arm"})
+        assert polled(server) == ["arm"]
+        assert stat.S_IMODE(server.path.parent.stat().st_mode) == 0o700
+
+
+def test_a_socket_that_cannot_be_made_again_yet_is_said_once_and_made_when_it_can(tmp_path):
+    with served(tmp_path) as server:
+        shutil.rmtree(server.path.parent)
+        server.path.parent.write_text("")
+        assert "was removed, and cannot be made again: " in server.restore()
+        assert server.restore() is None
+        server.path.parent.unlink()
+        assert "is made again" in server.restore()
+        assert_takes_an_estop(server)
+
+
+def test_a_daemon_that_has_taken_the_place_of_a_removed_socket_keeps_it(tmp_path):
+    server = ControlServer(tmp_path / "private" / "robot.sock", ACTIONS)
+    shutil.rmtree(server.path.parent)
+    server.path.parent.mkdir(mode=0o700)
+    with serving_elsewhere(server.path) as process:
+        assert f"a daemon already serves this socket (process {process})" in server.restore()
+        server.close()
+        with connect(server):
+            pass
 
 
 def test_a_file_that_is_no_socket_is_not_removed(tmp_path):

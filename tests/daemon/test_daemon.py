@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw.daemon.daemon import Daemon
-from disco_hw.log.recorder import NullRecorder
+from disco_hw.log.recorder import NullRecorder, RecorderStats
+from disco_hw.log.records import Event
 from disco_hw.runtime import IN_USE, State
 from disco_hw.runtime.assembly import assemble_core, create_pipeline, driver_of
 from disco_hw.runtime.core import PilotTick, TaskPilot
@@ -65,7 +66,7 @@ class Driven:
         self._now_ns, self._suspended_ns = START_NS, 0
         self.motion = Manual(speed_rad_s, speed_rad_s)
         self.daemon = Daemon(
-            self.core, SimpleNamespace(poll=list), Recorder(), self, SimpleNamespace(received=None),
+            self.core, SimpleNamespace(poll=list, restore=lambda: None), Recorder(), self, SimpleNamespace(received=None),
             lambda *_text: None, Hand(self.motion),
         )  # fmt: skip
 
@@ -186,3 +187,12 @@ def test_an_emergency_stop_goes_on_while_they_turn_where_they_brake_only_as_long
     assert driven.rig.speed_rad_s > 8.0
     driven.daemon.stop_wheels()
     assert driven.rig.speed_rad_s < 0.5
+
+
+def test_a_control_socket_that_was_removed_is_looked_for_every_second_and_recorded(tmp_path):
+    driven = Driven(tmp_path, "vesc")
+    driven.daemon._recorder_stats = RecorderStats()
+    driven.daemon._server = SimpleNamespace(restore=iter(["x.sock: was removed", None]).__next__)
+    recorded = [*driven.daemon._every_second(1000 * MS), *driven.daemon._every_second(2000 * MS)]
+    events = [(record.code, record.text) for record in recorded if type(record) is Event]
+    assert events == [("control socket", "x.sock: was removed")]

@@ -6,12 +6,14 @@ import subprocess
 import sys
 from contextlib import suppress
 from importlib.resources import files
+from pathlib import Path
 
 import pytest
 
 from disco_hw.daemon.process import Notifier
 
 UNIT = files("disco_hw") / "daemon" / "systemd" / "disco-hw@.service"
+PAGE = Path(__file__).parents[2] / "docs" / "service.md"
 SECOND_NS = 1_000_000_000
 
 
@@ -110,6 +112,9 @@ def test_the_unit_restarts_watches_stops_and_does_not_arm():
         ("WatchdogSec", "1"),
         ("Restart", "on-failure"),
         ("RestartPreventExitStatus", "2"),
+        # Poses and obstacles may come in by an address that is up only then.
+        ("Wants", "network-online.target"),
+        ("After", "network-online.target"),
         ("ExecStart", "/opt/disco-hw/.venv/bin/disco-hw run /etc/disco-hw/%i.toml"),
         ("ExecStopPost", "/opt/disco-hw/.venv/bin/disco-hw estop /etc/disco-hw/%i.toml"),
         ("LimitRTPRIO", "99"),
@@ -143,6 +148,12 @@ def test_the_unit_keeps_what_driving_needs():
     filters = [value for key, value in settings() if key == "SystemCallFilter"]
     # @resources has sched_setscheduler, @memlock has mlockall; both are in @system-service.
     assert filters == ["@system-service", "~@privileged"]
+
+
+def test_the_page_gives_key_files_to_the_units_user():
+    """A copy by root keeps mode 600 and is root's, so that the daemon could not read it."""
+    user = dict(settings())["User"]
+    assert re.search(rf"^sudo install -o {user} -m 600 KEY_FILE ", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
 
 
 def test_each_measure_of_the_unit_says_what_it_is_for():

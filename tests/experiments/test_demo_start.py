@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import pytest
 
 from disco_hw import experiments
-from disco_hw.errors import WorkError
-from disco_hw.experiments import Operator
+from disco_hw.errors import InputError, WorkError
+from disco_hw.experiments import Child, Operator, demo
 from disco_hw.experiments.demo import start_pose
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -169,3 +169,35 @@ def test_a_demonstration_that_is_ended_from_outside_leaves_no_process_behind(tmp
         assert select.select([child], [], [], 60.0)[0]
         os.close(child)
     assert number is signal.SIGKILL or not list(scratch.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("output", "expected_line"),
+    [
+        (
+            b"page: http://127.0.0.1:8080/?token=abc\nstate: x\n",
+            "page http://127.0.0.1:8080/?token=abc (until the drive",
+        ),
+        (
+            b"link: up\npage: --host 127.0.0.1 --port 8080: cannot listen there\npage: the page ended\n",
+            "page: --host 127",
+        ),
+        (b"link: up\npage: http://127.0.0.1:80", "page: no address in "),
+    ],
+    ids=["served", "another program has the port", "not yet"],
+)
+def test_an_address_is_shown_only_if_the_page_itself_has_said_it(monkeypatch, tmp_path, output, expected_line):
+    """Whoever listens on the port may be another program, to which the token must not be given."""
+    clock = SimulatedClock()
+    passing = SimpleNamespace(monotonic=lambda: clock.now_ns() * 1e-9, sleep=lambda s: clock.advance_ns(round(s * 1e9)))
+    monkeypatch.setattr(demo, "time", passing)
+    daemon = Child("daemon", None, tmp_path / "daemon.txt")
+    daemon.output.write_bytes(output)
+    assert demo.page_line(daemon).startswith(expected_line)
+
+
+def test_a_wrong_token_is_refused_before_anything_is_started(monkeypatch, tmp_path):
+    monkeypatch.setenv("DISCO_HW_PAGE_TOKEN", "abc")
+    with pytest.raises(InputError, match="DISCO_HW_PAGE_TOKEN: give 16 or more"):
+        demo.run_demo(demo.DemoOptions(out=tmp_path, view=True))
+    assert not list(tmp_path.iterdir())

@@ -1,13 +1,17 @@
 """The tick takes its poses from the source that robot.toml names."""
 
+import socket
+
 import msgspec
 import pytest
 
+from disco_hw.config import load_robot_config
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
 from disco_hw.runtime import assembly
 from disco_hw.runtime.assembly import pose_source_of
+from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
@@ -15,7 +19,7 @@ from drivers.pose import PoseSourceError
 from drivers.pose.robot import RobotPoses
 from drivers.types import PoseSample, WheelSample
 from tests.drive.test_hand_pilot import Hand
-from tests.runtime.simulated import ROBOT_FILE, recorded, replies, simulated_stack
+from tests.runtime.simulated import ROBOT_FILE, recorded, replies, robot_toml, simulated_stack
 
 
 class Elsewhere:
@@ -79,3 +83,26 @@ def test_a_source_that_cannot_be_had_is_bad_input(monkeypatch):
     monkeypatch.setattr(assembly, "create_pose_source", refuse)
     with pytest.raises(InputError, match=r"pose\.source: port 5005: in use; choose another$"):
         pose_source_of(load_setup(ROBOT_FILE).config)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        # 192.0.2.1 is of a network for examples (RFC 5737), as an address that is not up yet.
+        'source = "udp"\naddress = "192.0.2.1"\n',
+        'source = "natnet"\nnatnet_version = "3.1"\naddress = "192.0.2.1"\n',
+    ],
+)
+def test_an_address_that_is_not_up_yet_is_no_bad_input(tmp_path, lines):
+    """As when the service starts before the network: exit code 2 would keep it from being started again."""
+    with pytest.raises(WorkError, match=r"^robot\.toml: pose\.source: .*192\.0\.2\.1.*pose\.address"):
+        pose_source_of(load_robot_config(robot_toml(tmp_path, f"[pose]\n{lines}")))
+
+
+def test_a_port_for_obstacles_that_is_held_is_no_bad_input(tmp_path):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as holder:
+        holder.bind(("127.0.0.1", 0))
+        port = holder.getsockname()[1]
+        config = load_robot_config(robot_toml(tmp_path, f"[fence]\nobstacles_port = {port}\n"))
+        with pytest.raises(WorkError, match=rf"obstacles_port: 127\.0\.0\.1:{port}: Address already in use"):
+            obstacle_source_of(config)

@@ -8,7 +8,7 @@ import pytest
 from disco_hw.config import load_robot_config
 from disco_hw.daemon.check import pose_source_checks
 from disco_hw.daemon.control_socket import counters, status
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
 from disco_hw.log.load import load_drive
 from disco_hw.log.recorder import RecorderStats
 from disco_hw.runtime.assembly import create_planner, pose_source_of
@@ -125,7 +125,7 @@ def test_two_of_one_kind_are_numbered_and_a_port_taken_twice_is_said(tmp_path):
     lines = f'[pose]\nsource = "udp"\nport = {port}\n[[pose.also]]\nsource = "udp"\nport = {port}\n'
     config = load_robot_config(robot_toml(tmp_path, lines))
     assert config.pose.labels() == ("udp 1", "udp 2")
-    with pytest.raises(InputError, match=rf"pose\.source udp 2: 127\.0\.0\.1:{port}: Address already in use"):
+    with pytest.raises(WorkError, match=rf"pose\.source udp 2: 127\.0\.0\.1:{port}: Address already in use"):
         pose_source_of(config)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as again:
         # The first is closed with it.

@@ -8,8 +8,8 @@ import random
 
 import pytest
 
-from drivers.motor import find_driver
-from drivers.types import DriverState, Request, WheelCommand
+from drivers.motor import create_driver, find_driver
+from drivers.types import DriverState, Frame, ReceivedFrame, Request, WheelCommand
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.conformance import check_that_what_is_no_command_is_refused, check_that_wheels_follow
 from tests.drivers.motor.vendors import VENDORS
@@ -344,6 +344,16 @@ def test_another_host_that_commands_is_named_and_a_fault(vendor, bench, another_
     assert bench.driver.state is DriverState.FAULT
     assert "another host" in bench.driver.detail
     assert any("another host" in event for event in bench.events)
+
+
+def test_another_host_is_noticed_by_a_driver_that_has_only_listened(vendor):
+    if vendor.is_serial:
+        pytest.skip("a line with two ends has one host")
+    driver = create_driver(vendor.name, vendor.settings)
+    driver.link_up(0)
+    assert driver.receive(1, ()).other_host is None
+    frame = Frame(vendor.foreign.can_id, vendor.foreign.data, vendor.foreign.extended)
+    assert driver.receive(2, (ReceivedFrame(2, frame),)).other_host.startswith("it commands ")
 
 
 def test_garbage_is_counted_never_raises_and_never_moves_faster(new_bench):
