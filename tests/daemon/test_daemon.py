@@ -66,8 +66,8 @@ class Driven:
         self._now_ns, self._suspended_ns = START_NS, 0
         self.motion = Manual(speed_rad_s, speed_rad_s)
         self.daemon = Daemon(
-            self.core, SimpleNamespace(poll=list, restore=lambda: None), Recorder(), self, SimpleNamespace(received=None),
-            lambda *_text: None, Hand(self.motion),
+            self.core, SimpleNamespace(poll=list, restore=lambda: None), Recorder(), self,
+            SimpleNamespace(received=None), lambda *_text: None, Hand(self.motion),
         )  # fmt: skip
 
     def now_ns(self):
