@@ -155,7 +155,7 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
     """Return the lines that are printed before anything moves."""
     lines = []
     if script is not None:
-        room = room_needed(script.at, script.duration_s, config.robot)
+        room = room_needed(script, config.robot)
         lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.describe()}"]
     if not (options.gamepad or options.page or options.ros2 or options.unattended):
         lines.append(HELP)
@@ -196,7 +196,7 @@ def _source(
     if not config.fence.is_set:
         return ScriptSource(script, source)
     robot = odometry_parameters(setup.model)
-    room = room_needed(script.at, script.duration_s, config.robot)
+    room = room_needed(script, config.robot)
     return FittedScriptSource(script, source, robot, Boundaries(config.robot.footprint, config.fence), room)
 
 

@@ -6,28 +6,20 @@ before a manoeuvre that would lead from its true place too near to the fence, wh
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from disco_hw.drive import ManualInput, ManualSource, RobotView
-from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource, Wheels
+from disco_hw.drive.script import Array, Manoeuvre, Pose, Room, Script, ScriptSource, Wheels, driven_path
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence.clearance import Boundaries
 
-Array = NDArray[np.float64]
-Pose = tuple[float, float, float]
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3)
 """Parts of a script's speeds that are tried, the largest first."""
 SPARE_M = 0.08
 """Distance kept from the fence beyond its margin, for what the robot does otherwise than its model."""
 # Chosen: more finds a manoeuvre that fits sooner, and leaves the script's order further.
 _LOOK_AHEAD = 8
-# Chosen: shorter finds a smaller excursion between two points, and takes longer.
-_STEP_S = 0.05
 # As it is, mirrored, backward, and both.
 _VARIANTS = (("", 1.0, False), ("mirrored", 1.0, True), ("backward", -1.0, False), ("mirrored, backward", -1.0, True))
 
@@ -103,20 +95,6 @@ def _changed(manoeuvre: Manoeuvre, scale: float, description: str, sign: float, 
     slower = "" if scale == 1.0 else f"at {scale:.0%}"
     note = ", ".join(part for part in (description, slower) if part)
     return replace(manoeuvre, wheels=wheels, purpose=f"{manoeuvre.purpose} ({note})")
-
-
-def driven_path(manoeuvre: Manoeuvre, start: Pose, robot: OdometryParameters) -> Array:
-    """Poses (N, 3) of the tracked point over a manoeuvre, of a robot that does what it is told."""
-    count = max(1, math.ceil(manoeuvre.duration_s / _STEP_S))
-    step_s = manoeuvre.duration_s / count
-    wheels = np.array([manoeuvre.wheels((k + 0.5) * step_s) for k in range(count)])
-    moved = 0.5 * robot.wheel_radius_m * wheels.sum(axis=1) * step_s
-    turned = robot.wheel_radius_m * (wheels[:, 1] - wheels[:, 0]) / robot.axial_distance_m * step_s
-    yaw = start[2] + np.concatenate(([0.0], np.cumsum(turned)))
-    middle = yaw[:-1] + 0.5 * turned
-    x = start[0] + robot.x_icr_m * math.cos(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.cos(middle))))
-    y = start[1] + robot.x_icr_m * math.sin(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.sin(middle))))
-    return np.stack([x - robot.x_icr_m * np.cos(yaw), y - robot.x_icr_m * np.sin(yaw), yaw], axis=1)
 
 
 class FittedScriptSource:

@@ -12,11 +12,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
+import numpy as np
+from numpy.typing import NDArray
+
 from disco_hw.config import Robot
 from disco_hw.drive import ManualInput, ManualSource, RobotView
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime import State
 
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
 Wheels = tuple[float, float]
+# Chosen: shorter finds a smaller excursion between two points, and takes longer.
+_STEP_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,21 +107,30 @@ class Room:
         )
 
 
-def room_needed(wheels: Callable[[float], Wheels], duration_s: float, robot: Robot) -> Room:
-    """Return the room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
-    step_s = 0.02
-    x_m = y_m = yaw_rad = 0.0
-    xs, ys = [0.0], [0.0]
-    for k in range(math.ceil(duration_s / step_s)):
-        left, right = wheels(k * step_s)
-        travel_m = 0.5 * robot.wheel_radius_m * (left + right) * step_s
-        turn_rad = robot.wheel_radius_m * (right - left) / robot.axial_distance_m * step_s
-        x_m += travel_m * math.cos(yaw_rad + 0.5 * turn_rad)
-        y_m += travel_m * math.sin(yaw_rad + 0.5 * turn_rad)
-        yaw_rad += turn_rad
-        xs.append(x_m)
-        ys.append(y_m)
-    return Room((min(xs), max(xs)), (min(ys), max(ys)))
+def driven_path(manoeuvre: Manoeuvre, start: Pose, robot: OdometryParameters) -> Array:
+    """Poses (N, 3) of the tracked point over a manoeuvre, of a robot that does what it is told."""
+    count = max(1, math.ceil(manoeuvre.duration_s / _STEP_S))
+    step_s = manoeuvre.duration_s / count
+    wheels = np.array([manoeuvre.wheels((k + 0.5) * step_s) for k in range(count)])
+    moved = 0.5 * robot.wheel_radius_m * wheels.sum(axis=1) * step_s
+    turned = robot.wheel_radius_m * (wheels[:, 1] - wheels[:, 0]) / robot.axial_distance_m * step_s
+    yaw = start[2] + np.concatenate(([0.0], np.cumsum(turned)))
+    middle = yaw[:-1] + 0.5 * turned
+    x = start[0] + robot.x_icr_m * math.cos(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.cos(middle))))
+    y = start[1] + robot.x_icr_m * math.sin(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.sin(middle))))
+    return np.stack([x - robot.x_icr_m * np.cos(yaw), y - robot.x_icr_m * np.sin(yaw), yaw], axis=1)
+
+
+def room_needed(script: Script, robot: Robot) -> Room:
+    """Return the room that a script takes on a robot with exactly the nominal geometry; a real one needs more."""
+    geometry = OdometryParameters(robot.wheel_radius_m, robot.axial_distance_m, robot.x_icr_m)
+    paths, pose = list[Array](), (0.0, 0.0, 0.0)
+    for manoeuvre in script.manoeuvres:
+        paths.append(driven_path(manoeuvre, pose, geometry))
+        x_m, y_m, yaw_rad = paths[-1][-1].tolist()
+        pose = x_m, y_m, yaw_rad
+    x, y = np.concatenate(paths)[:, :2].T
+    return Room((float(x.min()), float(x.max())), (float(y.min()), float(y.max())))
 
 
 def in_table(script: Script) -> Sequence[str]:

@@ -10,8 +10,8 @@ import pytest
 
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput, RobotView
-from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, driven_path, fit_script
-from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource
+from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, fit_script
+from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource, driven_path
 from disco_hw.drive.scripts import create_script
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.fence import Circle, Fence, Footprint

@@ -40,7 +40,7 @@ def test_scripts_end_at_rest_say_what_for_and_take_a_minute_at_most_where_a_repo
 def test_the_circle_is_the_tasks_circle():
     task = CircleTask(radius_m=0.75, speed_m_s=0.2)
     script = create_script("circle", robot(), task, 0.8)
-    room = room_needed(script.at, script.duration_s, robot())
+    room = room_needed(script, robot())
     assert room.x_m == pytest.approx((-0.75, 0.75), abs=0.01)
     assert room.y_m == pytest.approx((0.0, 1.5), abs=0.01)
 
@@ -85,7 +85,7 @@ def test_steps_begin_with_the_search_for_the_limits_of_each_wheel_both_ways():
 def test_excite_takes_about_two_minutes_and_little_room():
     script = create_script("excite", robot(), CircleTask(), 0.8)
     assert 100.0 < script.duration_s < 150.0
-    room = room_needed(script.at, script.duration_s, robot())
+    room = room_needed(script, robot())
     assert room.x_m[1] - room.x_m[0] < 4.0
     assert room.y_m[1] - room.y_m[0] < 4.0
 
