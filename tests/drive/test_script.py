@@ -68,6 +68,13 @@ def test_the_tracked_point_behind_the_centre_of_rotation_needs_room_in_a_turn_on
     assert room.y_m == pytest.approx((-0.2, 0.2), abs=1e-3)
 
 
+def test_the_room_has_the_way_to_a_standstill_after_a_script_that_is_broken_off():
+    slow = msgspec.structs.replace(ROBOT, max_wheel_acceleration_rad_s2=2.0)
+    # 0.3 m of speeding up to 0.6 m/s in 3 s, cut after the first of them at 0.2 m/s: 0.1 m, and as much to stop.
+    room = room_needed(held(3.0, 6.0, 6.0).cut(1.0), slow)
+    assert room.x_m == pytest.approx((0.0, 0.2), abs=0.01)
+
+
 def test_the_table_says_when_what_and_what_for():
     assert [line.split() for line in in_table(SCRIPT)] == [
         ["0.0", "s", "first", "for", "first"],
