@@ -25,6 +25,7 @@ from disco_hw.drive.script import (
     stopping_path,
 )
 from disco_hw.fence.clearance import Boundaries
+from disco_hw.runtime import State
 
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3)
 """Parts of a script's speeds that are tried, the largest first."""
@@ -125,7 +126,7 @@ class FittedScriptSource:
         self._fitting: Iterator[Script | None] | None = None
         self._playing: ScriptSource | None = None
         self._refused: str | None = None
-        self._checked = 0
+        self._checked: tuple[int, int] | None = None
 
     @property
     def ended(self) -> str | None:
@@ -170,9 +171,12 @@ class FittedScriptSource:
 
     def _leads_out(self, playing: ScriptSource, robot: RobotView) -> bool:
         """Whether a manoeuvre that begins now would lead from where the robot is into the fence's margin."""
-        if playing.finished == self._checked or robot.pose is None or not playing.remaining:
+        # Not before it is armed, as until then it may be moved.
+        if playing.begun == self._checked or robot.state is not State.ARMED:
             return False
-        self._checked = playing.finished
+        if robot.pose is None or not playing.remaining:
+            return False
+        self._checked = playing.begun
         path, _ = driven_path(playing.remaining[0], robot.pose, self._robot, robot.wheels or STANDING)
         return not _keeps(path, self._bounds, self._bounds.fence.margin_m + 0.5 * SPARE_M)
 
@@ -198,7 +202,7 @@ class FittedScriptSource:
             return
         if fitted is None:
             return
-        self._fitting = None
+        self._fitting, self._checked = None, None
         if self._playing is None:
             self._playing = ScriptSource(fitted, self._deadman)
         else:

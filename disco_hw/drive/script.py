@@ -256,6 +256,7 @@ class ScriptSource:
         self._last_ns: int | None = None
         self._driven = False
         self._driving = False
+        self._restarts = 0
         self.completed = False
         """Whether the script was played to its end."""
         self._fenced = ""
@@ -293,6 +294,11 @@ class ScriptSource:
     def finished(self) -> int:
         """Number of manoeuvres that are over."""
         return self._script.over(self._driven_ns * 1e-9)
+
+    @property
+    def begun(self) -> tuple[int, int]:
+        """Numbers that change whenever a manoeuvre begins, or begins again."""
+        return self.finished, self._restarts
 
     @property
     def remaining(self) -> tuple[Manoeuvre, ...]:
@@ -354,6 +360,7 @@ class ScriptSource:
             place = self._script.place(self._driven_ns * 1e-9)
             self._driven_ns = 0 if place is None else round(place[1] * 1e9)
             self._driven = False
+            self._restarts += 1
         self._driving = robot.driving
         self._last_ns = now_ns
 

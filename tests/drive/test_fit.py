@@ -179,6 +179,41 @@ def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leave
     assert playing.ended == "script steps completed"
 
 
+def interrupted(playing: FittedScriptSource, ticks: int, again: Pose) -> ManualInput:
+    """Fit, drive for so long, release the deadman, and press it with the robot at a pose; returns the last input."""
+    views = 6 * [RobotView(State.READY, False, pose=CENTER)] + ticks * [RobotView(State.ARMED, True, pose=CENTER)]
+    views += 3 * [RobotView(State.READY, False, pose=CENTER)]
+    views += [
+        RobotView(State.ARMED, False, pose=msgspec.structs.astuple(again)),
+        RobotView(State.ARMED, True, pose=msgspec.structs.astuple(again)),
+    ]
+    return [playing.poll(tick * 20_000_000, view) for tick, view in enumerate(views)][-1]
+
+
+@pytest.mark.parametrize("ticks", [0, 100])
+def test_a_manoeuvre_that_begins_late_or_again_is_fitted_anew_where_it_would_leave_the_fence(ticks):
+    script = straight("far", 4.0), straight("other", 1.0)
+    assert interrupted(source(Fence(keep_in=Circle((0, 0), 2.4)), *script), ticks, Pose(0, 0, 0)).left_rad_s == 5.0
+    playing = source(Fence(keep_in=Circle((0, 0), 2.4)), *script)
+    held = interrupted(playing, ticks, Pose(1.2, 0.0, 0.0))
+    assert (held.left_rad_s, held.right_rad_s, held.deadman) == (0.0, 0.0, True)
+    for tick in range(4):
+        view = RobotView(State.ARMED, True, pose=(1.2, 0.0, 0.0))
+        held = playing.poll((ticks + 11 + tick) * 20_000_000, view)
+    assert held.left_rad_s < 0.0
+    assert "backward" in playing.task
+
+
+def test_a_robot_that_was_moved_while_it_was_fitted_anew_is_fitted_once_more():
+    playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight("far", 4.0), straight("other", 1.0))
+    interrupted(playing, 100, Pose(1.2, 0.0, 0.0))
+    # Pushed to the other side meanwhile, from where backward leads out.
+    for tick in range(8):
+        view = RobotView(State.ARMED, True, pose=(-1.2, 0.0, 0.0))
+        held = playing.poll((111 + tick) * 20_000_000, view)
+    assert held.left_rad_s > 0.0
+
+
 def test_while_it_is_fitted_anew_the_robot_stands_and_the_deadman_counts():
     far = Manoeuvre("far", "", 4.0, lambda t_s: (5.0, 5.0))
     playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight(seconds=1.0), far)
