@@ -21,7 +21,7 @@ from disco_hw.drive import PAD_STATUS_TEXT, GamepadSource, ManualSource, PageSou
 from disco_hw.drive.coverage import Coverage
 from disco_hw.drive.fit import FittedScriptSource
 from disco_hw.drive.hand_pilot import HandPilot
-from disco_hw.drive.script import Script, ScriptSource, Unattended, in_table, room_needed
+from disco_hw.drive.script import RobotModel, Script, ScriptSource, Unattended, in_table, room_needed
 from disco_hw.drive.scripts import create_script
 from disco_hw.drive.terminal import HELP, Keyboard, KeyHold
 from disco_hw.errors import InputError, LogError
@@ -155,7 +155,7 @@ def _announcement(options: DriveOptions, config: RobotConfig, script: Script | N
     """Return the lines that are printed before anything moves."""
     lines = []
     if script is not None:
-        room = room_needed(script.at, script.duration_s, config.robot)
+        room = room_needed(script, config.robot)
         lines += [*in_table(script), f"{script.duration_s:.0f} s, needs {room.describe()}"]
     if not (options.gamepad or options.page or options.ros2 or options.unattended):
         lines.append(HELP)
@@ -195,8 +195,8 @@ def _source(
         return source
     if not config.fence.is_set:
         return ScriptSource(script, source)
-    robot = odometry_parameters(setup.model)
-    room = room_needed(script.at, script.duration_s, config.robot)
+    robot = RobotModel(odometry_parameters(setup.model), config.robot.max_wheel_acceleration_rad_s2)
+    room = room_needed(script, config.robot)
     return FittedScriptSource(script, source, robot, Boundaries(config.robot.footprint, config.fence), room)
 
 

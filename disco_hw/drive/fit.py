@@ -6,28 +6,33 @@ before a manoeuvre that would lead from its true place too near to the fence, wh
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
-from numpy.typing import NDArray
-
 from disco_hw.drive import ManualInput, ManualSource, RobotView
-from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource, Wheels
-from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.drive.script import (
+    STANDING,
+    Array,
+    Manoeuvre,
+    Pose,
+    RobotModel,
+    Room,
+    Script,
+    ScriptSource,
+    Wheels,
+    driven_path,
+    end_of,
+    stopping_path,
+)
 from disco_hw.fence.clearance import Boundaries
+from disco_hw.runtime import State
 
-Array = NDArray[np.float64]
-Pose = tuple[float, float, float]
 SCALES = (1.0, 0.85, 0.7, 0.55, 0.4, 0.3)
 """Parts of a script's speeds that are tried, the largest first."""
 SPARE_M = 0.08
 """Distance kept from the fence beyond its margin, for what the robot does otherwise than its model."""
 # Chosen: more finds a manoeuvre that fits sooner, and leaves the script's order further.
 _LOOK_AHEAD = 8
-# Chosen: shorter finds a smaller excursion between two points, and takes longer.
-_STEP_S = 0.05
 # As it is, mirrored, backward, and both.
 _VARIANTS = (("", 1.0, False), ("mirrored", 1.0, True), ("backward", -1.0, False), ("mirrored, backward", -1.0, True))
 
@@ -37,22 +42,22 @@ class ScriptDoesNotFit(Exception):  # noqa: N818
 
 
 def fit_script(
-    script: Script, start: Pose, robot: OdometryParameters, bounds: Boundaries, room: Room
+    script: Script, start: Pose, robot: RobotModel, bounds: Boundaries, room: Room
 ) -> Iterator[Script | None]:
     """Yield None while it works, and at last a script that stays inside from this pose. Raises ScriptDoesNotFit.
 
-    `robot`: the geometry of its model. `room`: what the script takes as it is, for the message.
+    The robot stands there. `room`: what the script takes as it is, for the message.
     """
     keep_m = bounds.fence.margin_m + SPARE_M
     # All at one speed, the largest that there is; else each as fast as it can be.
     for scales in (*((scale,) for scale in SCALES), SCALES):
-        remaining, chosen, pose = list(script.manoeuvres), list[Manoeuvre](), start
+        remaining, chosen, pose, running = list(script.manoeuvres), list[Manoeuvre](), start, STANDING
         while remaining:
-            each = (_next_that_fits(remaining, scale, pose, robot, bounds, keep_m) for scale in scales)
+            each = (_next_that_fits(remaining, scale, pose, running, robot, bounds, keep_m) for scale in scales)
             found = next((one for one in each if one is not None), None)
             if found is None:
                 break
-            index, manoeuvre, pose = found
+            index, manoeuvre, pose, running = found
             chosen.append(manoeuvre)
             del remaining[index]
             yield None
@@ -67,9 +72,15 @@ def fit_script(
 
 
 def _next_that_fits(
-    remaining: list[Manoeuvre], scale: float, pose: Pose, robot: OdometryParameters, bounds: Boundaries, keep_m: float
-) -> tuple[int, Manoeuvre, Pose] | None:
-    """Return the first of the next manoeuvres that stays inside in some variant, and where it ends."""
+    remaining: list[Manoeuvre],
+    scale: float,
+    pose: Pose,
+    running: Wheels,
+    robot: RobotModel,
+    bounds: Boundaries,
+    keep_m: float,
+) -> tuple[int, Manoeuvre, Pose, Wheels] | None:
+    """Return the first of the next manoeuvres that stays inside in some variant, and the pose and speeds at its end."""
     finds_limits = any(one.finds_limits for one in remaining)
     for index, manoeuvre in enumerate(remaining[:_LOOK_AHEAD]):
         if manoeuvre.within_limits and finds_limits:
@@ -77,10 +88,9 @@ def _next_that_fits(
             continue
         for description, sign, mirrored in _VARIANTS:
             changed = _changed(manoeuvre, scale, description, sign, mirrored)
-            path = driven_path(changed, pose, robot)
+            path, reached = driven_path(changed, pose, robot, running)
             if _keeps(path, bounds, keep_m):
-                x_m, y_m, yaw_rad = path[-1].tolist()
-                return index, changed, (x_m, y_m, yaw_rad)
+                return index, changed, end_of(path), reached
     return None
 
 
@@ -105,32 +115,18 @@ def _changed(manoeuvre: Manoeuvre, scale: float, description: str, sign: float, 
     return replace(manoeuvre, wheels=wheels, purpose=f"{manoeuvre.purpose} ({note})")
 
 
-def driven_path(manoeuvre: Manoeuvre, start: Pose, robot: OdometryParameters) -> Array:
-    """Poses (N, 3) of the tracked point over a manoeuvre, of a robot that does what it is told."""
-    count = max(1, math.ceil(manoeuvre.duration_s / _STEP_S))
-    step_s = manoeuvre.duration_s / count
-    wheels = np.array([manoeuvre.wheels((k + 0.5) * step_s) for k in range(count)])
-    moved = 0.5 * robot.wheel_radius_m * wheels.sum(axis=1) * step_s
-    turned = robot.wheel_radius_m * (wheels[:, 1] - wheels[:, 0]) / robot.axial_distance_m * step_s
-    yaw = start[2] + np.concatenate(([0.0], np.cumsum(turned)))
-    middle = yaw[:-1] + 0.5 * turned
-    x = start[0] + robot.x_icr_m * math.cos(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.cos(middle))))
-    y = start[1] + robot.x_icr_m * math.sin(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.sin(middle))))
-    return np.stack([x - robot.x_icr_m * np.cos(yaw), y - robot.x_icr_m * np.sin(yaw), yaw], axis=1)
-
-
 class FittedScriptSource:
     """Plays a script, fitted into the fence from where the robot stands, while another source's deadman is held."""
 
     def __init__(
-        self, script: Script, deadman: ManualSource, robot: OdometryParameters, bounds: Boundaries, room: Room
+        self, script: Script, deadman: ManualSource, robot: RobotModel, bounds: Boundaries, room: Room
     ) -> None:
         self._script, self._deadman = script, deadman
         self._robot, self._bounds, self._room = robot, bounds, room
         self._fitting: Iterator[Script | None] | None = None
         self._playing: ScriptSource | None = None
         self._refused: str | None = None
-        self._checked = 0
+        self._checked: tuple[int, int] | None = None
 
     @property
     def ended(self) -> str | None:
@@ -161,7 +157,7 @@ class FittedScriptSource:
             self._fit(self._script, robot)
             return ManualInput(now_ns, 0.0, 0.0, deadman=False)
         if self._fitting is None and self._leads_out(playing, robot):
-            self._fitting = self._begin_fit(Script(self._script.name, playing.remaining), robot.pose)
+            self._fitting = self._begin_fit(Script(self._script.name, playing.remaining), robot)
         if self._fitting is not None:
             self._fit(self._script, robot)
             held = self._deadman.poll(now_ns, robot)
@@ -175,21 +171,28 @@ class FittedScriptSource:
 
     def _leads_out(self, playing: ScriptSource, robot: RobotView) -> bool:
         """Whether a manoeuvre that begins now would lead from where the robot is into the fence's margin."""
-        if playing.finished == self._checked or robot.pose is None or not playing.remaining:
+        # Not before it is armed, as until then it may be moved.
+        if playing.begun == self._checked or robot.state is not State.ARMED:
             return False
-        self._checked = playing.finished
-        path = driven_path(playing.remaining[0], robot.pose, self._robot)
+        if robot.pose is None or not playing.remaining:
+            return False
+        self._checked = playing.begun
+        path, _ = driven_path(playing.remaining[0], robot.pose, self._robot, robot.wheels or STANDING)
         return not _keeps(path, self._bounds, self._bounds.fence.margin_m + 0.5 * SPARE_M)
 
-    def _begin_fit(self, script: Script, pose: Pose | None) -> Iterator[Script | None] | None:
-        return None if pose is None else fit_script(script, pose, self._robot, self._bounds, self._room)
+    def _begin_fit(self, script: Script, robot: RobotView) -> Iterator[Script | None] | None:
+        """Fit the script from where the robot comes to stand."""
+        if robot.pose is None:
+            return None
+        start = end_of(stopping_path(robot.pose, self._robot, robot.wheels or STANDING))
+        return fit_script(script, start, self._robot, self._bounds, self._room)
 
     def _fit(self, script: Script, robot: RobotView) -> None:
         """Go on fitting, or begin to; what comes out is played."""
         if self._refused is not None:
             return
         if self._fitting is None:
-            self._fitting = self._begin_fit(script, robot.pose)
+            self._fitting = self._begin_fit(script, robot)
         if self._fitting is None:
             return
         try:
@@ -199,7 +202,7 @@ class FittedScriptSource:
             return
         if fitted is None:
             return
-        self._fitting = None
+        self._fitting, self._checked = None, None
         if self._playing is None:
             self._playing = ScriptSource(fitted, self._deadman)
         else:

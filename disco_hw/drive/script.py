@@ -12,11 +12,20 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
 
+import numpy as np
+from numpy.typing import NDArray
+
 from disco_hw.config import Robot
 from disco_hw.drive import ManualInput, ManualSource, RobotView
+from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime import State
 
+Array = NDArray[np.float64]
+Pose = tuple[float, float, float]
 Wheels = tuple[float, float]
+STANDING: Wheels = (0.0, 0.0)
+# Chosen: shorter finds a smaller excursion between two points, and takes longer.
+_STEP_S = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +62,7 @@ class Script:
     def at(self, t_s: float) -> Wheels:
         """Wheel speeds at a time since the start; zero before it and from the end on."""
         place = self.place(t_s)
-        return (0.0, 0.0) if place is None else place[0].wheels(t_s - place[1])
+        return STANDING if place is None else place[0].wheels(t_s - place[1])
 
     def place(self, t_s: float) -> tuple[Manoeuvre, float] | None:
         """Return the manoeuvre under way at a time and when it began (s); None before the start and from the end on."""
@@ -99,21 +108,75 @@ class Room:
         )
 
 
-def room_needed(wheels: Callable[[float], Wheels], duration_s: float, robot: Robot) -> Room:
-    """Return the room that a drive takes on a robot with exactly the nominal geometry; a real one needs more."""
-    step_s = 0.02
-    x_m = y_m = yaw_rad = 0.0
-    xs, ys = [0.0], [0.0]
-    for k in range(math.ceil(duration_s / step_s)):
-        left, right = wheels(k * step_s)
-        travel_m = 0.5 * robot.wheel_radius_m * (left + right) * step_s
-        turn_rad = robot.wheel_radius_m * (right - left) / robot.axial_distance_m * step_s
-        x_m += travel_m * math.cos(yaw_rad + 0.5 * turn_rad)
-        y_m += travel_m * math.sin(yaw_rad + 0.5 * turn_rad)
-        yaw_rad += turn_rad
-        xs.append(x_m)
-        ys.append(y_m)
-    return Room((min(xs), max(xs)), (min(ys), max(ys)))
+@dataclass(frozen=True, slots=True)
+class RobotModel:
+    """Robot that does what it is told, as fast as the governor lets its wheels change their speed."""
+
+    geometry: OdometryParameters
+    max_wheel_acceleration_rad_s2: float
+
+    def ramped(self, manoeuvre: Manoeuvre, count: int, running: Wheels) -> Array:
+        """Wheel speeds (count, 2) that the governor sends in each step of a manoeuvre that begins with `running`."""
+        step_s = manoeuvre.duration_s / count
+        most = self.max_wheel_acceleration_rad_s2 * step_s
+        left, right = running
+        speeds = []
+        for k in range(count):
+            desired = manoeuvre.wheels((k + 0.5) * step_s)
+            change = max(abs(desired[0] - left), abs(desired[1] - right))
+            # Along the straight line in wheel space, as far as the slower wheel allows.
+            share = most / change if change > most else 1.0
+            left += share * (desired[0] - left)
+            right += share * (desired[1] - right)
+            speeds.append((left, right))
+        return np.array(speeds)
+
+
+def driven_path(
+    manoeuvre: Manoeuvre, start: Pose, robot: RobotModel, running: Wheels = STANDING
+) -> tuple[Array, Wheels]:
+    """Poses (N, 3) of the tracked point over a manoeuvre, and the wheel speeds at its end.
+
+    `running`: the wheel speeds at its beginning.
+    """
+    count = max(1, math.ceil(manoeuvre.duration_s / _STEP_S))
+    step_s, body = manoeuvre.duration_s / count, robot.geometry
+    wheels = robot.ramped(manoeuvre, count, running)
+    moved = 0.5 * body.wheel_radius_m * wheels.sum(axis=1) * step_s
+    turned = body.wheel_radius_m * (wheels[:, 1] - wheels[:, 0]) / body.axial_distance_m * step_s
+    yaw = start[2] + np.concatenate(([0.0], np.cumsum(turned)))
+    middle = yaw[:-1] + 0.5 * turned
+    x = start[0] + body.x_icr_m * math.cos(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.cos(middle))))
+    y = start[1] + body.x_icr_m * math.sin(start[2]) + np.concatenate(([0.0], np.cumsum(moved * np.sin(middle))))
+    path = np.stack([x - body.x_icr_m * np.cos(yaw), y - body.x_icr_m * np.sin(yaw), yaw], axis=1)
+    left, right = wheels[-1].tolist()
+    return path, (left, right)
+
+
+def stopping_path(start: Pose, robot: RobotModel, running: Wheels) -> Array:
+    """Poses (N, 3) of the tracked point while the wheels come to a standstill."""
+    stop_s = max(map(abs, running)) / robot.max_wheel_acceleration_rad_s2
+    return driven_path(Manoeuvre("stop", "", stop_s, lambda _t_s: STANDING), start, robot, running)[0]
+
+
+def room_needed(script: Script, robot: Robot) -> Room:
+    """Return the room that a script takes on a robot with exactly the nominal geometry; a real one needs more."""
+    geometry = OdometryParameters(robot.wheel_radius_m, robot.axial_distance_m, robot.x_icr_m)
+    model = RobotModel(geometry, robot.max_wheel_acceleration_rad_s2)
+    paths, running = [np.zeros((1, 3))], STANDING
+    for manoeuvre in script.manoeuvres:
+        path, running = driven_path(manoeuvre, end_of(paths[-1]), model, running)
+        paths.append(path)
+    # One that is broken off ends with its wheels running.
+    paths.append(stopping_path(end_of(paths[-1]), model, running))
+    x, y = np.concatenate(paths)[:, :2].T
+    return Room((float(x.min()), float(x.max())), (float(y.min()), float(y.max())))
+
+
+def end_of(path: Array) -> Pose:
+    """Return the last pose of a path."""
+    x_m, y_m, yaw_rad = path[-1].tolist()
+    return x_m, y_m, yaw_rad
 
 
 def in_table(script: Script) -> Sequence[str]:
@@ -127,20 +190,32 @@ def in_table(script: Script) -> Sequence[str]:
 
 
 Profile = Callable[[float], tuple[float, float]]
-# Chosen: longer than wheels take to stop from a script's speeds; longer rests lengthen every script.
+# Chosen: longer than the shipped robot's wheels take to stop; longer rests lengthen every script.
 REST_S = 0.6
-
-
-def rest(duration_s: float = REST_S, purpose: str = "separates what comes before from what comes after") -> Manoeuvre:
-    """Create a manoeuvre that stands still."""
-    return Manoeuvre("rest", purpose, duration_s, lambda _t_s: (0.0, 0.0))
+# Chosen: for wheels that follow their ramp late.
+_SPARE_SHARE = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """Manoeuvres as shares of `top_rad_s`: (forward, turn to the left)."""
+    """Manoeuvres as shares of `top_rad_s`: (forward, turn to the left).
+
+    Rests and held ones are longer where the wheels take longer than REST_S to stop or to reach their speed.
+    """
 
     top_rad_s: float
+    max_wheel_acceleration_rad_s2: float = math.inf
+
+    def extra_s(self, share: float) -> float:
+        """Return by how much a ramp to a share of the speed takes longer than REST_S, in tenths of a second; or 0."""
+        ramp_s = share * self.top_rad_s / self.max_wheel_acceleration_rad_s2
+        return max(0, math.ceil(10.0 * ((1.0 + _SPARE_SHARE) * ramp_s - REST_S))) / 10.0
+
+    def rest(
+        self, duration_s: float = REST_S, purpose: str = "separates what comes before from what comes after"
+    ) -> Manoeuvre:
+        """Create a manoeuvre that stands still, after one of any share."""
+        return Manoeuvre("rest", purpose, duration_s + self.extra_s(1.0), lambda _t_s: STANDING)
 
     def play(self, name: str, purpose: str, duration_s: float, profile: Profile) -> Manoeuvre:
         """Shares as a function of the time since its start (s)."""
@@ -153,11 +228,12 @@ class Pieces:
 
     def hold(self, name: str, purpose: str, duration_s: float, forward: float, turn: float) -> Manoeuvre:
         """Create a manoeuvre of constant shares."""
-        return self.play(name, purpose, duration_s, lambda _t_s: (forward, turn))
+        longer_s = duration_s + self.extra_s(abs(forward) + abs(turn))
+        return self.play(name, purpose, longer_s, lambda _t_s: (forward, turn))
 
     def each(self, purpose: str, *state: tuple[str, float, float, float]) -> list[Manoeuvre]:
         """Several held ones (name, duration, forward, turn), each followed by a rest."""
-        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), rest())]
+        return [part for one in state for part in (self.hold(one[0], purpose, *one[1:]), self.rest())]
 
 
 # Five periods at 50 Hz: after a longer pause of the loop the script goes on from where it was.
@@ -180,6 +256,7 @@ class ScriptSource:
         self._last_ns: int | None = None
         self._driven = False
         self._driving = False
+        self._restarts = 0
         self.completed = False
         """Whether the script was played to its end."""
         self._fenced = ""
@@ -217,6 +294,11 @@ class ScriptSource:
     def finished(self) -> int:
         """Number of manoeuvres that are over."""
         return self._script.over(self._driven_ns * 1e-9)
+
+    @property
+    def begun(self) -> tuple[int, int]:
+        """Numbers that change whenever a manoeuvre begins, or begins again."""
+        return self.finished, self._restarts
 
     @property
     def remaining(self) -> tuple[Manoeuvre, ...]:
@@ -278,6 +360,7 @@ class ScriptSource:
             place = self._script.place(self._driven_ns * 1e-9)
             self._driven_ns = 0 if place is None else round(place[1] * 1e9)
             self._driven = False
+            self._restarts += 1
         self._driving = robot.driving
         self._last_ns = now_ns
 

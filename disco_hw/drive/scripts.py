@@ -16,7 +16,7 @@ from dataclasses import replace
 from types import MappingProxyType
 
 from disco_hw.config import Robot
-from disco_hw.drive.script import Manoeuvre, Pieces, Script, rest
+from disco_hw.drive.script import Manoeuvre, Pieces, Script
 from disco_hw.errors import InputError
 from disco_hw.tasks import RobotTask
 from disco_hw.tasks.circle import CircleTask, circle_task
@@ -60,13 +60,13 @@ def _starts(pieces: Pieces, count: int) -> list[Manoeuvre]:
     found: list[Manoeuvre] = []
     for number in range(count):
         forward = (1.0, -1.0, 0.5, -0.5)[number % 4]
-        found += [pieces.hold(f"start and stop {number + 1}", _START, 0.8, forward, 0.0), rest()]
+        found += [pieces.hold(f"start and stop {number + 1}", _START, 0.8, forward, 0.0), pieces.rest()]
     return found
 
 
 def _steering(pieces: Pieces, duration_s: float) -> list[Manoeuvre]:
     steer = pieces.play("steering", _STEER, duration_s, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s)))
-    return [steer, rest()]
+    return [steer, pieces.rest()]
 
 
 def _ramps(pieces: Pieces, duration_s: float) -> list[Manoeuvre]:
@@ -86,7 +86,7 @@ def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
         "spins": 2 * (_slow_spins(pieces, 4.0) + _fast_spins(pieces, 3.0)),
         "curves": 2 * _curves(pieces, 4.0, 3.0),
         "starts": _starts(pieces, 12) + _steering(pieces, 10.0),
-        "ramps": 2 * [*_ramps(pieces, 8.0), rest()],
+        "ramps": 2 * [*_ramps(pieces, 8.0), pieces.rest()],
         # Turns and straights at either end, for what changes on the way.
         "separate": [
             *_slow_straights(pieces, 2.0),
@@ -95,7 +95,7 @@ def _built(pieces: Pieces) -> dict[str, list[Manoeuvre]]:
             *_starts(pieces, 6),
             *_steering(pieces, 4.0),
             *_ramps(pieces, 5.0),
-            rest(),
+            pieces.rest(),
             *_slow_spins(pieces, 2.0),
             *_fast_spins(pieces, 1.5),
             *_fast_straights(pieces, 2.0),
@@ -116,10 +116,10 @@ PURPOSES: Mapping[str, str] = MappingProxyType(
 SEPARATING = tuple(PURPOSES)
 
 
-def separating(name: str, top_rad_s: float) -> Script:
+def separating(name: str, top_rad_s: float, max_wheel_acceleration_rad_s2: float = math.inf) -> Script:
     """Return the script of that name with wheel speeds up to `top_rad_s`, from rest to rest; raises KeyError."""
-    pieces = Pieces(top_rad_s)
-    return Script(name, (rest(1.0), *_built(pieces)[name], rest(1.0)))
+    pieces = Pieces(top_rad_s, max_wheel_acceleration_rad_s2)
+    return Script(name, (pieces.rest(1.0), *_built(pieces)[name], pieces.rest(1.0)))
 
 
 SCRIPTS = ("circle", "steps", "excite", *SEPARATING)
@@ -138,50 +138,46 @@ def create_script(name: str, robot: Robot, task: RobotTask, speed_share: float, 
 
     Raises InputError for an unknown name, and for `circle` if the task is none or too fast for the wheels.
     """
-    top_rad_s = speed_share * robot.max_wheel_speed_rad_s
+    pieces = Pieces(speed_share * robot.max_wheel_speed_rad_s, robot.max_wheel_acceleration_rad_s2)
     match name:
         case "circle":
-            return circle(robot, circle_task(task, "--script circle"), top_rad_s)
+            return circle(robot, circle_task(task, "--script circle"), pieces)
         case "steps":
-            return steps(top_rad_s, seed, top_rad_s / robot.max_wheel_acceleration_rad_s2)
+            return steps(pieces, seed)
         case "excite":
-            return excite(top_rad_s)
+            return excite(pieces)
         case _ if name in SEPARATING:
-            return separating(name, top_rad_s)
+            return separating(name, pieces.top_rad_s, pieces.max_wheel_acceleration_rad_s2)
         case _:
             raise InputError(f"--script {name}: no such script; write one of {', '.join(SCRIPTS)}")
 
 
-def circle(robot: Robot, task: CircleTask, top_rad_s: float) -> Script:
+def circle(robot: Robot, task: CircleTask, pieces: Pieces) -> Script:
     """Two laps of the task's circle, counter-clockwise at constant wheel speeds, from rest to rest.
 
-    Raises InputError if a wheel would need more than `top_rad_s`.
+    Raises InputError if a wheel would need more than the largest speed of `pieces`.
     """
     yaw_rate_rad_s = task.speed_m_s / task.radius_m
     half_m = 0.5 * robot.axial_distance_m
     left = (task.speed_m_s - yaw_rate_rad_s * half_m) / robot.wheel_radius_m
     right = (task.speed_m_s + yaw_rate_rad_s * half_m) / robot.wheel_radius_m
-    if max(abs(left), abs(right)) > top_rad_s:
+    if max(abs(left), abs(right)) > pieces.top_rad_s:
         raise InputError(
             f"--script circle: the outer wheel would need {right:.2f} rad/s, and drive.speed_share of "
-            f"robot.max_wheel_speed_rad_s is {top_rad_s:.4g}; lower task.speed_m_s, or raise task.radius_m or "
+            f"robot.max_wheel_speed_rad_s is {pieces.top_rad_s:.4g}; lower task.speed_m_s, or raise task.radius_m or "
             "drive.speed_share"
         )
     laps_s = _LAPS * 2.0 * math.pi / yaw_rate_rad_s
     purpose = "the paper's drive; cannot distinguish the wheel radius from slip, nor left from right"
-    return Script(
-        "circle", (rest(1.0), Manoeuvre("circle to the left", purpose, laps_s, _constant(left, right)), rest())
-    )
+    laps = Manoeuvre("circle to the left", purpose, laps_s, _constant(left, right))
+    return Script("circle", (pieces.rest(1.0), laps, pieces.rest()))
 
 
-def steps(top_rad_s: float, seed: int, settling_s: float = 0.0) -> Script:
-    """Wheel speeds drawn evenly within the limits that the wheels show first, 6 s each; at most `top_rad_s`.
-
-    `settling_s`: from rest to `top_rad_s`.
-    """
-    pieces = Pieces(top_rad_s)
+def steps(pieces: Pieces, seed: int) -> Script:
+    """Wheel speeds drawn evenly within the limits that the wheels show first, 6 s each; at most those of `pieces`."""
+    top_rad_s = pieces.top_rad_s
     search = "finds the largest wheel speed that is reached"
-    hold_s = FIND_S + settling_s
+    hold_s = FIND_S + top_rad_s / pieces.max_wheel_acceleration_rad_s2
     found: list[Manoeuvre] = []
     for name, forward, turn in (
         ("as fast as it goes", 1.0, 0.0),
@@ -189,24 +185,26 @@ def steps(top_rad_s: float, seed: int, settling_s: float = 0.0) -> Script:
         ("as fast as it turns left", 0.0, 1.0),
         ("as fast as it turns right", 0.0, -1.0),
     ):
-        found += [replace(pieces.hold(name, search, hold_s, forward, turn), finds_limits=True), rest()]
+        held = pieces.hold(name, search, hold_s, forward, turn)
+        found += [replace(held, duration_s=hold_s, finds_limits=True), pieces.rest()]
     draw = random.Random(seed)
     purpose = "steady motion anywhere within the limits, and the step to it"
+    # A step may be from full speed to full speed the other way.
+    step_s = STEP_S + 2.0 * pieces.extra_s(1.0)
     for number in range(1, STEPS + 1):
         left, right = draw.uniform(-1.0, 1.0), draw.uniform(-1.0, 1.0)
         wheels = _constant(left * top_rad_s, right * top_rad_s)
         name = f"step {number}: {left:+.0%} {right:+.0%} of the limits"
-        found.append(Manoeuvre(name, purpose, STEP_S, wheels, within_limits=True))
-    return Script("steps", (*found, rest()))
+        found.append(Manoeuvre(name, purpose, step_s, wheels, within_limits=True))
+    return Script("steps", (*found, pieces.rest()))
 
 
-def excite(top_rad_s: float) -> Script:
+def excite(pieces: Pieces) -> Script:
     """Return a short drive after which nearly all parameters and effects can be distinguished; it ends near its start.
 
-    Shares below are of `top_rad_s`: (forward, turn to the left).
+    Shares below are those of `pieces`: (forward, turn to the left).
     """
-    pieces = Pieces(top_rad_s)
-    found: list[Manoeuvre] = [rest(2.0, "noise of the poses at standstill")]
+    found: list[Manoeuvre] = [pieces.rest(2.0, "noise of the poses at standstill")]
     found += pieces.each(
         "wheel radius, and what grows with speed: gain, slip, pose latency",
         ("slow straight", 4.0, 0.4, 0.0),
@@ -233,13 +231,13 @@ def excite(top_rad_s: float) -> Script:
     lag = "lag and delay from command to wheel, slip under acceleration"
     for number in range(8):
         forward = 0.7 if number % 2 == 0 else -0.7
-        found += [pieces.hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), rest(0.8)]
+        found += [pieces.hold(f"start and stop {number + 1}", lag, 1.0, forward, 0.0), pieces.rest(0.8)]
     steering = "separates delay from lag, build-up of turning under load"
     found += [
         pieces.play("steering at 0.5 Hz", steering, 12.0, lambda t_s: (0.4, 0.35 * math.cos(math.pi * t_s))),
-        rest(),
+        pieces.rest(),
         *_ramps(pieces, 10.0),
-        rest(2.0, "noise of the poses at standstill, elsewhere"),
+        pieces.rest(2.0, "noise of the poses at standstill, elsewhere"),
     ]
     return Script("excite", tuple(found))
 

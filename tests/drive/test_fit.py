@@ -5,21 +5,23 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 import pytest
 
 from disco_hw.config import SHIPPED_ROBOT
-from disco_hw.drive import ManualInput, RobotView
-from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, driven_path, fit_script
-from disco_hw.drive.script import Manoeuvre, Room, Script, ScriptSource
+from disco_hw.drive import ManualInput, RobotView, fit
+from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, fit_script
+from disco_hw.drive.script import Manoeuvre, RobotModel, Room, Script, ScriptSource, driven_path, room_needed
 from disco_hw.drive.scripts import create_script
-from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.estimation.odometry import OdometryParameters, Pose, arc, moved
 from disco_hw.fence import Circle, Fence, Footprint
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.runtime import State
+from disco_hw.runtime.pipeline import Governor, WheelLimits
 from disco_hw.runtime.robot_setup import load_setup
 
-ROBOT = OdometryParameters(0.06, 0.4, 0.1)
+ROBOT = RobotModel(OdometryParameters(0.06, 0.4, 0.1), math.inf)
 FOOTPRINT = Footprint(0.5, 0.4, 0.05)
 ROOM_NEEDED = Room((-0.5, 2.5), (-1.0, 1.0))
 CENTER = (0.0, 0.0, 0.0)
@@ -47,16 +49,16 @@ def fitted(script: Script, fence: Fence, pose=CENTER) -> Script:
 def least_m(script: Script, fence: Fence, pose=CENTER) -> float:
     least, bounds = math.inf, Boundaries(FOOTPRINT, fence)
     for manoeuvre in script.manoeuvres:
-        path = driven_path(manoeuvre, pose, ROBOT)
+        path, _ = driven_path(manoeuvre, pose, ROBOT)
         pose = tuple(path[-1].tolist())
         least = min(least, float(bounds.clearance_m(path).min()))
     return least
 
 
 def test_a_path_is_that_of_the_wheels():
-    ahead = driven_path(straight(), (1.0, 2.0, math.pi / 2), ROBOT)
+    ahead, _ = driven_path(straight(), (1.0, 2.0, math.pi / 2), ROBOT)
     np.testing.assert_allclose(ahead[[0, -1]], [[1.0, 2.0, math.pi / 2], [1.0, 3.5, math.pi / 2]], atol=1e-12)
-    turned = driven_path(Manoeuvre("spin", "", 2.0, lambda t_s: (-2.0, 2.0)), CENTER, ROBOT)
+    turned, _ = driven_path(Manoeuvre("spin", "", 2.0, lambda t_s: (-2.0, 2.0)), CENTER, ROBOT)
     assert turned[-1, 2] == pytest.approx(0.06 * 4.0 / 0.4 * 2.0)
     # About a point ahead of the tracked one.
     centre = turned[:, :2] + 0.1 * np.stack([np.cos(turned[:, 2]), np.sin(turned[:, 2])], axis=1)
@@ -89,6 +91,21 @@ def test_the_shipped_scripts_fit_into_a_small_room(name, side_m):
     assert sorted(one.name for one in found.manoeuvres) == sorted(one.name for one in script.manoeuvres)
     assert least_m(found, fence, (0.0, 0.0, 0.3)) >= 0.05 + 0.08
     assert least_m(script, fence, (0.0, 0.0, 0.3)) < 0.05 + 0.08
+
+
+def test_slow_wheels_stay_inside_too():
+    setup = load_setup(SHIPPED_ROBOT)
+    slow = msgspec.structs.replace(setup.config.robot, max_wheel_acceleration_rad_s2=2.0)
+    script = create_script("separate", slow, setup.config.task, 0.8)
+    bounds = Boundaries(FOOTPRINT, Fence(keep_in=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))))
+    model = RobotModel(ROBOT.geometry, 2.0)
+    *_, found = fit_script(script, CENTER, model, bounds, room_needed(script, slow))
+    governor, pose, path = Governor(WheelLimits(8.0, 2.0, 2.0), 0.02), Pose(*CENTER), []
+    for k in range(round(found.duration_s / 0.02)):
+        sent = governor.step(*found.at(k * 0.02), 0.02)
+        pose = moved(pose, arc(ROBOT.geometry, sent.left_rad_s * 0.02, sent.right_rad_s * 0.02))
+        path.append((pose.x_m, pose.y_m, pose.yaw_rad))
+    assert bounds.clearance_m(np.array(path)).min() > 0.05
 
 
 def test_limits_are_found_before_what_is_scaled_into_them():
@@ -131,14 +148,14 @@ class AlwaysPressed:
         pass
 
 
-def drive(source: FittedScriptSource, robot: OdometryParameters, bounds: Boundaries) -> float:
+def drive(source: FittedScriptSource, robot: RobotModel, bounds: Boundaries) -> float:
     """Let a robot with another geometry obey until the source ends; returns its least clearance (m)."""
     pose, deadman, least = CENTER, False, math.inf
     for tick in range(20_000):
         given = source.poll(tick * 20_000_000, RobotView(State.ARMED, deadman, pose=pose))
         deadman = given.deadman
         wheels = (given.left_rad_s, given.right_rad_s) if deadman else (0.0, 0.0)
-        path = driven_path(Manoeuvre("tick", "", 0.02, lambda t_s, wheels=wheels: wheels), pose, robot)
+        path, _ = driven_path(Manoeuvre("tick", "", 0.02, lambda t_s, wheels=wheels: wheels), pose, robot)
         pose = tuple(path[-1].tolist())
         if tick % 10 == 0:
             least = min(least, float(bounds.clearance_m(path).min()))
@@ -149,17 +166,52 @@ def drive(source: FittedScriptSource, robot: OdometryParameters, bounds: Boundar
 
 def test_a_robot_that_is_otherwise_than_its_model_is_fitted_anew_before_it_leaves_the_fence():
     fence = Fence(keep_in=((-1.5, -1.5), (1.5, -1.5), (1.5, 1.5), (-1.5, 1.5)))
-    bounds, other = Boundaries(FOOTPRINT, fence), OdometryParameters(0.068, 0.36, 0.1)
+    bounds, other = Boundaries(FOOTPRINT, fence), RobotModel(OdometryParameters(0.068, 0.36, 0.1), math.inf)
     script = shipped("steps")
     pose, planned = CENTER, math.inf
     for manoeuvre in fitted(script, fence).manoeuvres:
-        path = driven_path(manoeuvre, pose, other)
+        path, _ = driven_path(manoeuvre, pose, other)
         pose, planned = tuple(path[-1].tolist()), min(planned, float(bounds.clearance_m(path).min()))
     playing = FittedScriptSource(script, AlwaysPressed(), ROBOT, bounds, ROOM_NEEDED)
     assert planned < 0.0
     assert drive(playing, other, bounds) > 0.0
     assert playing.completed
     assert playing.ended == "script steps completed"
+
+
+def interrupted(playing: FittedScriptSource, ticks: int, again: Pose) -> ManualInput:
+    """Fit, drive for so long, release the deadman, and press it with the robot at a pose; returns the last input."""
+    views = 6 * [RobotView(State.READY, False, pose=CENTER)] + ticks * [RobotView(State.ARMED, True, pose=CENTER)]
+    views += 3 * [RobotView(State.READY, False, pose=CENTER)]
+    views += [
+        RobotView(State.ARMED, False, pose=msgspec.structs.astuple(again)),
+        RobotView(State.ARMED, True, pose=msgspec.structs.astuple(again)),
+    ]
+    return [playing.poll(tick * 20_000_000, view) for tick, view in enumerate(views)][-1]
+
+
+@pytest.mark.parametrize("ticks", [0, 100])
+def test_a_manoeuvre_that_begins_late_or_again_is_fitted_anew_where_it_would_leave_the_fence(ticks):
+    script = straight("far", 4.0), straight("other", 1.0)
+    assert interrupted(source(Fence(keep_in=Circle((0, 0), 2.4)), *script), ticks, Pose(0, 0, 0)).left_rad_s == 5.0
+    playing = source(Fence(keep_in=Circle((0, 0), 2.4)), *script)
+    held = interrupted(playing, ticks, Pose(1.2, 0.0, 0.0))
+    assert (held.left_rad_s, held.right_rad_s, held.deadman) == (0.0, 0.0, True)
+    for tick in range(4):
+        view = RobotView(State.ARMED, True, pose=(1.2, 0.0, 0.0))
+        held = playing.poll((ticks + 11 + tick) * 20_000_000, view)
+    assert held.left_rad_s < 0.0
+    assert "backward" in playing.task
+
+
+def test_a_robot_that_was_moved_while_it_was_fitted_anew_is_fitted_once_more():
+    playing = source(Fence(keep_in=Circle((0, 0), 2.4)), straight("far", 4.0), straight("other", 1.0))
+    interrupted(playing, 100, Pose(1.2, 0.0, 0.0))
+    # Pushed to the other side meanwhile, from where backward leads out.
+    for tick in range(8):
+        view = RobotView(State.ARMED, True, pose=(-1.2, 0.0, 0.0))
+        held = playing.poll((111 + tick) * 20_000_000, view)
+    assert held.left_rad_s > 0.0
 
 
 def test_while_it_is_fitted_anew_the_robot_stands_and_the_deadman_counts():
@@ -179,6 +231,32 @@ def test_while_it_is_fitted_anew_the_robot_stands_and_the_deadman_counts():
         given = playing.poll((tick + more) * 20_000_000, RobotView(State.ARMED, True, pose=(1.5, 0.0, 0.0)))
     assert given.left_rad_s < 0.0
     assert "backward" in playing.task
+
+
+def test_wheels_that_still_run_count_in_what_leads_out_and_in_where_it_is_fitted_from(monkeypatch):
+    starts = []
+    monkeypatch.setattr(fit, "fit_script", lambda script, start, *_: iter([starts.append(start), script]))
+    rest = Manoeuvre("rest", "", 0.6, lambda _t_s: (0.0, 0.0))
+    playing = FittedScriptSource(
+        Script("s", (straight(seconds=1.0), rest)),
+        AlwaysPressed(),
+        RobotModel(ROBOT.geometry, 2.0),
+        Boundaries(FOOTPRINT, Fence(keep_in=Circle((0, 0), 2.4))),
+        ROOM_NEEDED,
+    )
+    for tick in range(100):
+        begun = playing.task.startswith("rest")
+        # It runs at 0.3 m/s near the fence when the rest begins.
+        view = (
+            RobotView(State.ARMED, tick > 3, (5.0, 5.0), (1.9, 0.0, 0.0))
+            if begun
+            else RobotView(State.ARMED, tick > 3, (0.0, 0.0), CENTER)
+        )
+        playing.poll(tick * 20_000_000, view)
+        if begun:
+            break
+    assert starts[0] == CENTER
+    assert starts[1] == pytest.approx((1.9 + 0.375, 0.0, 0.0), abs=0.01)
 
 
 def test_a_robot_that_came_to_where_nothing_fits_ends_the_script():

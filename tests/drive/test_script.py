@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -45,15 +46,33 @@ def test_a_cut_script_is_the_same_until_the_cut(seconds, t_s):
         assert cut.at(t_s) == (0.0, 0.0)
 
 
+def held(duration_s, left, right):
+    return Script("held", (Manoeuvre("hold", "", duration_s, lambda _t_s: (left, right)),))
+
+
 def test_room_of_a_straight_and_of_a_circle():
-    straight = room_needed(lambda _t: (5.0, 5.0), 4.0, ROBOT)
+    straight = room_needed(held(4.0, 5.0, 5.0), ROBOT)
     assert straight.x_m == pytest.approx((0.0, 2.0))
     assert straight.y_m == (0.0, 0.0)
     # v = 0.5 m/s and 1 rad/s: a circle of radius 0.5 m to the left.
-    circle = room_needed(lambda _t: (2.5, 7.5), 2.0 * math.pi, ROBOT)
+    circle = room_needed(held(2.0 * math.pi, 2.5, 7.5), ROBOT)
     assert circle.x_m == pytest.approx((-0.5, 0.5), abs=1e-3)
     assert circle.y_m == pytest.approx((0.0, 1.0), abs=1e-3)
     assert circle.describe().startswith("about 0.5 m ahead, 0.5 m behind, 1.0 m to the left and 0.0 m to the right")
+
+
+def test_the_tracked_point_behind_the_centre_of_rotation_needs_room_in_a_turn_on_the_spot():
+    # 1 rad/s about a point 0.2 m ahead.
+    room = room_needed(held(2.0 * math.pi, -2.5, 2.5), msgspec.structs.replace(ROBOT, x_icr_m=0.2))
+    assert room.x_m == pytest.approx((0.0, 0.4), abs=1e-3)
+    assert room.y_m == pytest.approx((-0.2, 0.2), abs=1e-3)
+
+
+def test_the_room_has_the_way_to_a_standstill_after_a_script_that_is_broken_off():
+    slow = msgspec.structs.replace(ROBOT, max_wheel_acceleration_rad_s2=2.0)
+    # 0.3 m of speeding up to 0.6 m/s in 3 s, cut after the first of them at 0.2 m/s: 0.1 m, and as much to stop.
+    room = room_needed(held(3.0, 6.0, 6.0).cut(1.0), slow)
+    assert room.x_m == pytest.approx((0.0, 0.2), abs=0.01)
 
 
 def test_the_table_says_when_what_and_what_for():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,11 +14,15 @@ from disco_hw.drive.script import room_needed
 from disco_hw.drive.scripts import SCRIPTS, SEPARATING, STEP_S, STEPS, create_script
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError
+from disco_hw.estimation.odometry import OdometryParameters, Pose, arc, moved
+from disco_hw.runtime.pipeline import Governor, WheelLimits
 from disco_hw.tasks.circle import CircleTask
 
 
-def robot(top=8.0):
-    return Robot(name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=top)
+def robot(top=8.0, **fields):
+    return Robot(
+        name="r", wheel_radius_m=0.06, axial_distance_m=0.31, ticks_per_rev=2048, max_wheel_speed_rad_s=top, **fields
+    )
 
 
 @given(
@@ -40,7 +45,7 @@ def test_scripts_end_at_rest_say_what_for_and_take_a_minute_at_most_where_a_repo
 def test_the_circle_is_the_tasks_circle():
     task = CircleTask(radius_m=0.75, speed_m_s=0.2)
     script = create_script("circle", robot(), task, 0.8)
-    room = room_needed(script.at, script.duration_s, robot())
+    room = room_needed(script, robot())
     assert room.x_m == pytest.approx((-0.75, 0.75), abs=0.01)
     assert room.y_m == pytest.approx((0.0, 1.5), abs=0.01)
 
@@ -85,9 +90,38 @@ def test_steps_begin_with_the_search_for_the_limits_of_each_wheel_both_ways():
 def test_excite_takes_about_two_minutes_and_little_room():
     script = create_script("excite", robot(), CircleTask(), 0.8)
     assert 100.0 < script.duration_s < 150.0
-    room = room_needed(script.at, script.duration_s, robot())
+    room = room_needed(script, robot())
     assert room.x_m[1] - room.x_m[0] < 4.0
     assert room.y_m[1] - room.y_m[0] < 4.0
+
+
+@pytest.mark.parametrize(
+    ("name", "acceleration", "x_icr_m"),
+    [("excite", 20.0, 0.0), ("excite", 5.0, 0.2), ("excite", 2.0, 0.0), ("steps", 2.0, 0.0), ("separate", 2.0, 0.2)],
+)
+def test_the_room_is_what_the_governor_lets_the_robot_take(name, acceleration, x_icr_m):
+    slow = robot(max_wheel_acceleration_rad_s2=acceleration, x_icr_m=x_icr_m)
+    script = create_script(name, slow, CircleTask(), 0.8)
+    governor = Governor(WheelLimits(8.0, acceleration, acceleration), 0.02)
+    geometry, pose, ways = OdometryParameters(0.06, 0.31, x_icr_m), Pose(0.0, 0.0, 0.0), [(0.0, 0.0)]
+    for k in range(math.ceil(script.duration_s / 0.02)):
+        sent = governor.step(*script.at(k * 0.02), 0.02)
+        pose = moved(pose, arc(geometry, sent.left_rad_s * 0.02, sent.right_rad_s * 0.02))
+        ways.append((pose.x_m, pose.y_m))
+    room = room_needed(script, slow)
+    assert [room.x_m, room.y_m] == pytest.approx(np.transpose([np.min(ways, 0), np.max(ways, 0)]), abs=0.06)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+@pytest.mark.parametrize("acceleration", [20.0, 2.0])
+def test_slow_wheels_reach_the_speed_of_each_held_manoeuvre_and_stand_after_each_rest(name, acceleration):
+    script = create_script(name, robot(max_wheel_acceleration_rad_s2=acceleration), CircleTask(), 0.8)
+    governor = Governor(WheelLimits(8.0, acceleration, acceleration), 0.02)
+    for manoeuvre in script.manoeuvres:
+        desired = [manoeuvre.wheels(k * 0.02) for k in range(round(manoeuvre.duration_s / 0.02))]
+        sent = [governor.step(*wheels, 0.02) for wheels in desired][-1]
+        if len(set(desired)) == 1:
+            assert (sent.left_rad_s, sent.right_rad_s) == pytest.approx(desired[0])
 
 
 def test_an_unknown_script_is_refused_with_the_names_there_are():
