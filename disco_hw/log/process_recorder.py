@@ -366,13 +366,12 @@ class ProcessRecorder:
 
     def _report_losses(self) -> None:
         """Report at the end how many ticks are in no file, and why."""
-        delivery = self._delivery
-        missing = delivery.waiting_ticks + delivery.dropped_ticks
-        if missing:
-            given = delivery.ticks + delivery.dropped_ticks
+        stats = self._stats()
+        if stats.missing_ticks:
+            given = stats.ticks + stats.dropped_ticks
             slow = "too many ticks waited for a slow disk"
-            busy = slow if not delivery.waiting_ticks else "the log writer is still busy"
-            self._fault = f"{missing} of {given} ticks are not in the log: {self._last_error or busy}"
+            busy = slow if not stats.waiting_ticks else "the log writer is still busy"
+            self._fault = f"{stats.missing_ticks} of {given} ticks are not in the log: {self._last_error or busy}"
             self._messages.append(self._fault)
 
     def _note(self, sentence: str) -> None:

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from disco_hw.daemon.run import close_recorder
 from disco_hw.errors import LogError
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder, wall_offset_ns
@@ -164,8 +165,20 @@ def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(p
     assert all_accounted(final, following - 1)
     assert recorded_ticks(recorder.path) == list(range(final.lost_ticks + 1, following))
     assert final.lost_ticks > 20
+    assert final.fault.startswith(f"{final.lost_ticks} of {following - 1} ticks are not in the log: ")
+    assert recorder.new_messages()[-1] == final.fault
     with open_log(recorder.path) as log:
         assert (log.metadata.continues, log.metadata.continues_sequence) == (str(path), final.lost_ticks)
+
+
+def test_a_log_deleted_before_its_end_is_not_complete_and_run_fails(path, recorder):
+    drive(recorder, 1, 5)
+    shutil.rmtree(path.parent)
+    said = []
+    with pytest.raises(LogError, match="the log is not complete"):
+        close_recorder(recorder, lambda topic, text: said.append((topic, text)))
+    assert [text for topic, text in said if topic == "recording" and "5 of 5 ticks are not in the log" in text]
+    assert recorder.poll().missing_ticks == 5
 
 
 def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on(path, recorder):
