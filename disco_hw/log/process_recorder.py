@@ -193,6 +193,9 @@ class ProcessRecorder:
             # There may be room again.
             self._retry_s = 0.0
             while (self._line is not None or self._delivery.waiting_ticks) and time.monotonic() < deadline_s:
+                if self._line is None or not self._line.has_received:
+                    # It may have died while armed. A writer that records needs none.
+                    self.repair()
                 self._exchange(self._recording.queue_ticks)
                 self._look_after(time.monotonic())
                 self._wait(min(_CLOSING_STEP_S, max(0.0, deadline_s - time.monotonic())))
@@ -376,7 +379,7 @@ class ProcessRecorder:
 
     def _note(self, sentence: str) -> None:
         """Report a failure, but not again while it only repeats itself."""
-        if sentence != self._last_error or self._retries <= 1:
+        if sentence not in self._messages and (sentence != self._last_error or self._retries <= 1):
             self._messages.append(sentence)
         self._last_error = sentence
 

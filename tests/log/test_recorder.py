@@ -9,6 +9,7 @@ import pytest
 
 from disco_hw.daemon.run import close_recorder
 from disco_hw.errors import LogError
+from disco_hw.log import writer_link
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder, wall_offset_ns
 from disco_hw.log.reader import open_log
@@ -198,6 +199,34 @@ def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on
     final = recorder.close()
     assert (final.dropped_ticks, final.lost_ticks) == (0, 0)
     assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))
+
+
+def test_what_came_since_keeper_and_writer_died_while_armed_is_saved_at_the_end(path, recorder):
+    drive(recorder, 1, 5)
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
+    for process in (recorder.keeper_pid, recorder.writer_pid):
+        os.kill(process, signal.SIGKILL)
+    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+    final = recorder.close(60.0)
+    assert (final.delivered_ticks, final.missing_ticks, final.fault) == (following - 1, 0, "")
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))
+
+
+def test_a_keeper_that_cannot_be_made_at_the_end_is_reported_once(recorder, monkeypatch):
+    drive(recorder, 1, 5)
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
+    for process in (recorder.keeper_pid, recorder.writer_pid):
+        os.kill(process, signal.SIGKILL)
+    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+    recorder.new_messages()
+
+    def fail(*_, **__):
+        raise LogError("no process can be made")
+
+    monkeypatch.setattr(writer_link, "spawn_at_normal_priority", fail)
+    final = recorder.close(0.2)
+    assert final.waiting_ticks == following - 1 - final.delivered_ticks > 0
+    assert recorder.new_messages().count("no process can be made") == 1
 
 
 def test_one_writer_after_the_other_may_die(path, recorder):
