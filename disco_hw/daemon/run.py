@@ -167,7 +167,7 @@ def serve(
             if advice_style is not None and log is not None:
                 name = shlex.quote(str(log))
                 stop.add("log", lambda: report("log", f"look at it: disco-hw view {name}, or disco-hw log info {name}"))
-            stop.add(_RECORDER, lambda: _close_recorder(recorder, report))
+            stop.add(_RECORDER, lambda: close_recorder(recorder, report))
             adaptation = create_fast_adaptation(setup, pipeline) if adapts else None
             for step in processes.enter_real_time(config.daemon.realtime_priority):
                 report("real time", str(step))
@@ -234,7 +234,7 @@ def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
         raise WorkError(str(error)) from None
 
 
-def _close_recorder(recorder: Recorder, report: Report) -> None:
+def close_recorder(recorder: Recorder, report: Report) -> None:
     """End the log and report where its ticks are; raises LogError if some are in no file."""
     stats = recorder.close()
     for sentence in recorder.new_messages():
@@ -242,8 +242,8 @@ def _close_recorder(recorder: Recorder, report: Report) -> None:
     if stats.path:
         # No fault: of those `drive` makes a drive that is not whole.
         report("log", describe_recording(asdict(stats)))
-    if stats.waiting_ticks or stats.dropped_ticks:
-        raise LogError("the log is not complete; free space on its disk before the next drive")
+    if stats.missing_ticks:
+        raise LogError("the log is not complete; keep its file, and free space on its disk before the next drive")
 
 
 _RECORDER = "recorder"

@@ -156,7 +156,7 @@ class SimulatedRun:
         for now_ns, records in ticks:
             recorder.put(now_ns, records)
         stats = recorder.close(_CLOSING_S)
-        if stats.dropped_ticks or stats.refused:
+        if stats.missing_ticks or stats.refused:
             raise WorkError(f"{path}: could not be written completely; check the disk")
 
 

@@ -23,8 +23,8 @@ from disco_hw.log.records import TOPIC_INDEX, TOPICS, Record
 ENCODE_ERRORS = (TypeError, ValueError, OverflowError, KeyError)
 """What encoding raises for something that is not a record, or a record with content that it cannot have."""
 
-TICK, END = 0, 1
-"""Kinds of frames to the writer: a `Batch`, and the `End` after which none follows."""
+TICK, END, STATES_IN_FORCE = 0, 1, 2
+"""Kinds of frames to the writer: a `Batch`, the `End` after which none follows, and a `Batch` for the next tick's."""
 # Chosen: above any message to or from the keeper and any status of a writer, whose longest parts are paths.
 MESSAGE_BYTES = 65_536
 
@@ -96,11 +96,15 @@ Time64 = Annotated[int, msgspec.Meta(ge=-(2**63) + 1, le=2**63 - 1)]
 
 
 class End(msgspec.Struct, frozen=True):
-    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped."""
+    """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped.
+
+    `continued`: the file is full, and the recorder goes on in another part.
+    """
 
     t_ns: Time64
     sequence: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     dropped_ticks: int
+    continued: bool = False
 
 
 class WriterStatus(msgspec.Struct, frozen=True):

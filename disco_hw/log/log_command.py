@@ -6,6 +6,7 @@ import json
 import math
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from heapq import merge
@@ -106,6 +107,8 @@ def _controller(record: Controller) -> str:
 
 def _describe_end(summary: LogSummary) -> str:
     """Describe in words whether the log ended properly."""
+    if summary.ended and summary.continued and summary.complete:
+        return "ended properly as it was full; the next part continues it"
     if summary.ended:
         return "ended properly" if summary.complete else "ended by its recorder, but the file is not whole"
     if summary.ended is None:
@@ -147,10 +150,10 @@ class Recovered:
 def recover_log(source: Path, target: Path) -> Recovered:
     """Copy all complete chunks, attachments and metadata; the source stays as it is.
 
-    Works on any MCAP file with zstd or no compression. Raises LogError if the source is no MCAP file or has no message
-    that can be read, or the target exists or cannot be written; a half-written target is removed.
+    Works on any MCAP file, of any size, with zstd or no compression. Raises LogError if the source is no MCAP file or
+    has no message that can be read, or the target exists or cannot be written; a half-written target is removed.
     """
-    fd = open_file(source, LOG)
+    fd = open_file(source, replace(LOG, most_bytes=sys.maxsize))
     try:
         contents = read_contents(fd, str(source))
         try:

@@ -263,14 +263,19 @@ class McapLog:
         self._channels = tuple(self._json_channel(topic.name, topic.record) for topic in TOPICS)
         self._view_channels = self._register_views(() if start.scene is None else ((SCENE, SceneUpdate),))
         self._scene = None if start.scene is None else scene_message(start.scene)
+        self._states: tuple[tuple[int, msgspec.Raw], ...] = ()
         self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def begin_with(self, message: bytes) -> None:
+        """Write the records of this message with the first tick: what was in force where the former part ended."""
+        batch = self._batch(message)
+        if batch is not None:
+            self._states = batch.records
 
     def write(self, message: bytes) -> None:
         """Write the records of one message of the recorder."""
-        try:
-            batch = self._decoder.batch(message)
-        except msgspec.MsgspecError as error:
-            self._refuse(f"a message of {len(message)} bytes: {error}")
+        batch = self._batch(message)
+        if batch is None:
             return
         self._sequence = batch.sequence
         log_time = batch.now_ns + self._offset_ns
@@ -282,8 +287,9 @@ class McapLog:
             sequence, scene = batch.sequence & 0xFFFFFFFF, self._scene
             self._writer.add_message(self._view_channels[SCENE], log_time, scene, log_time, sequence)
             self._scene = None
-        for topic_index, data in batch.records:
+        for topic_index, data in (*self._states, *batch.records):
             self._write_record(batch, log_time, topic_index, data)
+        self._states = ()
         if self._pending_bytes > CHUNK_BYTES:
             self.flush()
 
@@ -303,6 +309,13 @@ class McapLog:
         """Finish the file with its index; nothing can be written after it."""
         self.flush()
         self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def _batch(self, message: bytes) -> Batch | None:
+        try:
+            return self._decoder.batch(message)
+        except msgspec.MsgspecError as error:
+            self._refuse(f"a message of {len(message)} bytes: {error}")
+            return None
 
     def _write_record(self, batch: Batch, log_time: int, topic_index: int, data: msgspec.Raw) -> None:
         try:

@@ -20,6 +20,7 @@ import msgspec
 from disco_hw.errors import LogError
 from disco_hw.log import (
     ENCODE_ERRORS,
+    STATES_IN_FORCE,
     TICK,
     Attachment,
     End,
@@ -30,7 +31,7 @@ from disco_hw.log import (
     frame,
 )
 from disco_hw.log.recorder import RecorderStats
-from disco_hw.log.records import Record
+from disco_hw.log.records import STATES, Record
 from disco_hw.log.writer_link import Delivery, KeeperLink, WriterLine
 
 # Chosen: catches up after a pause of the writer, without holding up the tick.
@@ -52,6 +53,9 @@ _RETRY_S = (0.0, 1.0, 2.0, 5.0)
 # Chosen: how often the end is looked for while the log closes.
 _CLOSING_STEP_S = 0.02
 _CLOSING_RETRY_S = 0.2
+# Chosen: 3 h of driving or 9 h of standing. Until it ends the writer keeps up to 1.5 kB of index for each flush, which
+# has 15 kB or more: so the size bounds its memory as well, to 0.1 GB.
+_PART_BYTES = 1 << 30
 
 
 def wall_offset_ns() -> int:
@@ -65,7 +69,8 @@ def wall_offset_ns() -> int:
 class RecordingSettings:
     """Header of a log, and how many control cycles may wait for the writer (`queue_ticks`) before more are dropped.
 
-    `planner`: version of the planner that the log's plans are of, 0 to name none.
+    `planner`: version of the planner that the log's plans are of, 0 to name none. `part_bytes`: a file of this size is
+    ended, and the log goes on in another part.
     """
 
     path: Path
@@ -75,12 +80,13 @@ class RecordingSettings:
     attachments: tuple[Attachment, ...] = ()
     scene: TaskScene | None = None
     queue_ticks: int = 1000
+    part_bytes: int = _PART_BYTES
     flush_s: float = 0.5
     offset_ns: int = field(default_factory=wall_offset_ns)
 
 
 class ProcessRecorder:
-    """Records through a writer process, which is replaced when it dies, freezes or cannot write.
+    """Records through a writer process, which is replaced when it dies, freezes or cannot write, or its file is full.
 
     Make it before the loop starts: that takes as long as starting Python. A replacement is a fork of another process
     and costs the loop some microseconds; it begins a file of its own, with all that is not in the former one. Raises
@@ -120,6 +126,9 @@ class ProcessRecorder:
         self._start = start
         self._keeper = KeeperLink(start)
         self._line: WriterLine | None = None
+        # The writer of a full part confirms what it was sent; then it writes the index while the next one records.
+        self._part_ends = False
+        self._finishing: WriterLine | None = None
         self._status = WriterStatus("recording", str(recording.path), 1)
         # Of the newest file that holds something: a writer that fails before its first tick leaves no file.
         self._kept_status = self._status
@@ -153,7 +162,8 @@ class ProcessRecorder:
         if self._final is not None:
             self._delivery.drop(len(records))
             return
-        self._delivery.put(self._sequence, len(records), frame(TICK, message))
+        states = tuple(record for record in records if type(record) in STATES)
+        self._delivery.put(self._sequence, len(records), frame(TICK, message), states)
         self._send(_SENT_PER_TICK)
         if self._delivery.waiting_ticks > _UNREAD_TICKS:
             # Only for who never polls: each look costs some microseconds.
@@ -192,7 +202,10 @@ class ProcessRecorder:
             self._end = msgspec.msgpack.encode(End(time.monotonic_ns(), self._sequence, self._delivery.dropped_ticks))
             # There may be room again.
             self._retry_s = 0.0
-            while (self._line is not None or self._delivery.waiting_ticks) and time.monotonic() < deadline_s:
+            while self._is_busy and time.monotonic() < deadline_s:
+                if self._delivery.waiting_ticks and (self._line is None or not self._line.has_received):
+                    # It may have died while armed. A writer that records needs none.
+                    self.repair()
                 self._exchange(self._recording.queue_ticks)
                 self._look_after(time.monotonic())
                 self._wait(min(_CLOSING_STEP_S, max(0.0, deadline_s - time.monotonic())))
@@ -204,8 +217,16 @@ class ProcessRecorder:
             if self._line is not None:
                 self._line.close()
                 self._line = None
+            if self._finishing is not None:
+                self._finishing.close()
+                self._finishing = None
             self._keeper.close()
         return self._final
+
+    @property
+    def _is_busy(self) -> bool:
+        """Whether ticks or a writer have yet to come to their end."""
+        return self._line is not None or self._finishing is not None or self._delivery.waiting_ticks > 0
 
     def _await_first_writer(self) -> None:
         deadline_s = time.monotonic() + _START_PATIENCE_S
@@ -243,7 +264,12 @@ class ProcessRecorder:
 
     def _send(self, most: int) -> None:
         line, delivery = self._line, self._delivery
-        if line is None or not line.send_rest():
+        if line is None or not line.send_rest() or self._part_ends:
+            return
+        if self._is_part_full(line.status):
+            end = End(time.monotonic_ns(), delivery.last_sent, delivery.dropped_ticks, continued=True)
+            self._part_ends = True
+            line.send_end(msgspec.msgpack.encode(end))
             return
         for _ in range(most):
             following = delivery.next_frame()
@@ -254,6 +280,11 @@ class ProcessRecorder:
                 return
         if self._end is not None and delivery.next_frame() is None:
             line.send_end(self._end)
+
+    def _is_part_full(self, status: WriterStatus) -> bool:
+        """Whether the part is to be ended; not without a keeper, which starts the next writer."""
+        full = status.sequence > 0 and status.bytes >= self._recording.part_bytes
+        return full and self._end is None and self._finishing is None and self._keeper.alive
 
     def _read(self) -> None:
         line, delivery = self._line, self._delivery
@@ -271,6 +302,10 @@ class ProcessRecorder:
             self._report_slow_disk(status)
 
     def _look_after(self, now_s: float) -> None:
+        self._look_after_finishing()
+        if self._part_ends and self._delivery.is_confirmed:
+            self._finishing = self._leave_part()
+            self._retry_s = now_s
         line = self._line
         if line is None:
             if now_s >= self._retry_s and (self._end is None or self._delivery.waiting_ticks):
@@ -302,12 +337,24 @@ class ProcessRecorder:
             self._patience_s *= 2.0
             self._writer_ended(now_s, f"the log writer did not answer for {silent_s:.1f} s and was stopped")
 
-    def _writer_ended(self, now_s: float, cause: str) -> None:
+    def _look_after_finishing(self) -> None:
+        """Report if the index of the former part could not be written; its ticks are in the file."""
+        line = self._finishing
+        if line is not None:
+            line.send_rest()
+            line.read()
+            if line.ended:
+                if line.status.state != "finished":
+                    self._note(_cause(line, None))
+                line.close()
+                self._finishing = None
+
+    def _leave_part(self) -> WriterLine:
+        """Let go of the present writer, so that the next one begins another part; returns the line to it."""
         line = self._line
         assert line is not None
         status = line.status
-        line.close()
-        self._line, self._frozen = None, False
+        self._line, self._frozen, self._part_ends = None, False, False
         self._refused += status.refused
         if status.deleted:
             self._delivery.file_deleted()
@@ -317,6 +364,12 @@ class ProcessRecorder:
             self._next_part = status.part + 1
             self._continues = status.path
         self._delivery.new_file()
+        return line
+
+    def _writer_ended(self, now_s: float, cause: str) -> None:
+        line = self._leave_part()
+        status = line.status
+        line.close()
         if self._end is not None and status.state == "finished":
             self._recovered()
             return
@@ -341,6 +394,9 @@ class ProcessRecorder:
         connection = self._keeper.launch(request)
         if connection is not None:
             self._line = WriterLine(connection, self._start.path, self._next_part)
+            if self._delivery.states:
+                states = self._encode(0, 0, tuple(self._delivery.states.values()))
+                self._line.send(frame(STATES_IN_FORCE, states))
             self._next_part = max(2, self._next_part)
         else:
             self._retry_s = time.monotonic() + _RETRY_S[-1]
@@ -366,18 +422,17 @@ class ProcessRecorder:
 
     def _report_losses(self) -> None:
         """Report at the end how many ticks are in no file, and why."""
-        delivery = self._delivery
-        missing = delivery.waiting_ticks + delivery.dropped_ticks
-        if missing:
-            given = delivery.ticks + delivery.dropped_ticks
+        stats = self._stats()
+        if stats.missing_ticks:
+            given = stats.ticks + stats.dropped_ticks
             slow = "too many ticks waited for a slow disk"
-            busy = slow if not delivery.waiting_ticks else "the log writer is still busy"
-            self._fault = f"{missing} of {given} ticks are not in the log: {self._last_error or busy}"
+            busy = slow if not stats.waiting_ticks else "the log writer is still busy"
+            self._fault = f"{stats.missing_ticks} of {given} ticks are not in the log: {self._last_error or busy}"
             self._messages.append(self._fault)
 
     def _note(self, sentence: str) -> None:
         """Report a failure, but not again while it only repeats itself."""
-        if sentence != self._last_error or self._retries <= 1:
+        if sentence not in self._messages and (sentence != self._last_error or self._retries <= 1):
             self._messages.append(sentence)
         self._last_error = sentence
 

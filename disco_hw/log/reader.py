@@ -120,8 +120,8 @@ class LogSummary(msgspec.Struct, frozen=True):
     `missing_ticks` were given to the recorder and are not in the file: between its ticks, before the first as far as
     the former part says, and after the last where the log was ended. `segment_breaks`: of an import, how often a new
     segment begins. `ended`: the recorder ended it, at `end`; None for
-    a log from before that was recorded. `complete`: its index is there. `continues`: the former part. `damage`: what of
-    the file is lost.
+    a log from before that was recorded. `continued`: as the file was full, and the log goes on in another part.
+    `complete`: its index is there. `continues`: the former part. `damage`: what of the file is lost.
     """
 
     path: str
@@ -129,6 +129,7 @@ class LogSummary(msgspec.Struct, frozen=True):
     complete: bool
     ended: bool | None
     end: str
+    continued: bool
     continues: str
     robot: str
     version: str
@@ -290,6 +291,7 @@ class Log:
             complete=self.complete,
             ended=True if ending is not None else False if self.metadata.format >= FORMAT else None,
             end=_iso((last if ending is None else ending.t_ns) + self.metadata.wall_offset_ns),
+            continued=ending is not None and ending.continued,
             continues=self.metadata.continues,
             robot=self.metadata.robot,
             version=self.metadata.version,

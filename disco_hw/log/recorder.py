@@ -35,6 +35,11 @@ class RecorderStats:
     fault: str = ""
     last_error: str = ""
 
+    @property
+    def missing_ticks(self) -> int:
+        """Number of given ticks that are in no file."""
+        return self.waiting_ticks + self.dropped_ticks + self.lost_ticks
+
 
 class Recorder(Protocol):
     """Takes the records of each tick; no call but `close` waits for anything, and none raises on what it is given."""

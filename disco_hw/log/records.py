@@ -364,6 +364,9 @@ TOPICS: tuple[Topic, ...] = (
     Topic("/obstacle", Obstacle),
 )
 
+STATES: frozenset[type] = frozenset({DaemonState, Task, BeliefChange, Controller, FenceChange})
+"""Types of the records that hold until the next of the same type; each file of a log begins with those in force."""
+
 TOPIC_INDEX: Mapping[type, int] = MappingProxyType({topic.record: index for index, topic in enumerate(TOPICS)})
 TOPIC_BY_NAME: Mapping[str, Topic] = MappingProxyType({topic.name: topic for topic in TOPICS})
 

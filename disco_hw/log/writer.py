@@ -23,7 +23,7 @@ from typing import Literal
 
 import msgspec
 
-from disco_hw.log import END, MESSAGE_BYTES, End, Ended, Frames, Start, Started, WriterStatus
+from disco_hw.log import END, MESSAGE_BYTES, STATES_IN_FORCE, End, Ended, Frames, Start, Started, WriterStatus
 from disco_hw.log.mcap_log import McapLog
 
 # EX_CANTCREAT and EX_IOERR of sysexits.h.
@@ -193,7 +193,10 @@ class Session:
             if kind == END:
                 self._log.end(msgspec.msgpack.decode(payload, type=End))
                 return True
-            self._log.write(payload)
+            if kind == STATES_IN_FORCE:
+                self._log.begin_with(payload)
+            else:
+                self._log.write(payload)
         if self.sequence != before:
             self._report("recording")
         return not data
@@ -207,6 +210,9 @@ class Session:
 
     def _finish(self) -> None:
         """Write the index and return when all is on the disk."""
+        # The index of a large file takes seconds, and the recorder begins the next part when it knows that all is here.
+        self._log.flush()
+        self._report("recording")
         self._log.finish()
         self._report("recording")
         self._sync.finish()

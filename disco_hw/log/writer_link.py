@@ -18,6 +18,7 @@ import msgspec
 
 from disco_hw.errors import LogError
 from disco_hw.log import END, MESSAGE_BYTES, Ended, Start, Started, WriterStatus, frame
+from disco_hw.log.records import Record
 from disco_hw.processes import spawn_at_normal_priority
 
 
@@ -229,18 +230,18 @@ class KeeperLink:
 
 
 class _Parcel(NamedTuple):
-    """One tick on its way: its number, how many records it has, and its frame."""
+    """One tick on its way: its number, its frame, and those of its records that hold until the next of their type."""
 
     sequence: int
-    records: int
     frame: bytes
+    states: tuple[Record, ...]
 
 
 class Delivery:
     """Keeps each tick until the writer says that it is in the file; a new writer is sent again what was not.
 
     given = delivered + lost + waiting + dropped, in ticks. `dropped_ticks`: `most` were waiting already. `lost_ticks`:
-    they were in a file that was deleted.
+    they were in a file that was deleted. `states`: of each type of `STATES` the last one that was delivered.
     """
 
     def __init__(self, most: int) -> None:
@@ -251,6 +252,7 @@ class Delivery:
         self.lost_ticks = 0
         self.delivered_ticks = 0
         self.last_delivered = 0
+        self.states: dict[type, Record] = {}
         self._most = most
         self._waiting: deque[_Parcel] = deque()
         self._sent = 0
@@ -261,14 +263,24 @@ class Delivery:
         """Ticks that were taken and are not in a file yet."""
         return len(self._waiting)
 
-    def put(self, sequence: int, records: int, frame: bytes) -> None:
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether all that the present writer was sent is in its file."""
+        return not self._sent
+
+    @property
+    def last_sent(self) -> int:
+        """Number of the last tick that the present writer was sent, or that was delivered before; 0 if none was."""
+        return self._waiting[self._sent - 1].sequence if self._sent else self.last_delivered
+
+    def put(self, sequence: int, records: int, frame: bytes, states: tuple[Record, ...] = ()) -> None:
         """Take a tick, or drop it."""
         if len(self._waiting) >= self._most:
             self.drop(records)
             return
         self.ticks += 1
         self.records += records
-        self._waiting.append(_Parcel(sequence, records, frame))
+        self._waiting.append(_Parcel(sequence, frame, states))
 
     def drop(self, records: int) -> None:
         """Count a tick that is not taken."""
@@ -286,7 +298,7 @@ class Delivery:
     def acknowledge(self, sequence: int) -> None:
         """Note that all ticks up to this number that were sent are in the present file."""
         while self._sent and self._waiting[0].sequence <= sequence:
-            self._waiting.popleft()
+            self.states |= {type(state): state for state in self._waiting.popleft().states}
             self._sent -= 1
             self._in_file += 1
             self.delivered_ticks += 1

@@ -116,10 +116,15 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
     `tolerance`: what numbers may differ by, in their own units or as a share of the larger, whichever allows more; 0
     for bit for bit, which only the machine that recorded promises: another processor rounds sums differently. The plans
     are made as those of the log's planner version.
-    Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml, or plans
-    of a planner version that is not known here.
+    Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml, that
+    continues another, or that has plans of a planner version that is not known here.
     """
     with open_log(path) as log:
+        if log.metadata.continues_sequence:
+            raise InputError(
+                f"{path}: continues {log.metadata.continues}, and a replay needs a run from its first tick on; give "
+                "the first part"
+            )
         first = next((entry.record for entry in log.records(("/command",))), None)
         if isinstance(first, Command) and first.source not in _SOURCES:
             raise InputError(

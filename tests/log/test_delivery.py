@@ -1,6 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from disco_hw.log.records import DaemonState, Task
 from disco_hw.log.writer_link import Delivery
 
 STEP = st.sampled_from(["put", "send", "new file", "deleted"]) | st.tuples(st.just("acknowledge"), st.integers(0, 60))
@@ -65,6 +66,23 @@ def test_only_what_was_in_the_deleted_file_is_lost():
     delivery.acknowledge(5)
     delivery.file_deleted()
     assert (delivery.delivered_ticks, delivery.lost_ticks, delivery.waiting_ticks) == (2, 3, 1)
+
+
+def test_states_are_those_of_the_delivered_ticks():
+    delivery = Delivery(10)
+    for k, texts in enumerate(("one", "two"), start=1):
+        delivery.put(k, 2, b"%d" % k, (DaemonState(k, texts, ""), Task(k, texts)))
+    delivery.put(3, 1, b"3", (Task(3, "three"),))
+    for _ in range(3):
+        delivery.sent()
+    delivery.acknowledge(2)
+    delivery.new_file()
+    assert {kind: state.t_ns for kind, state in delivery.states.items()} == {DaemonState: 2, Task: 2}
+    assert (delivery.last_sent, delivery.is_confirmed) == (2, True)
+    delivery.sent()
+    assert (delivery.last_sent, delivery.is_confirmed) == (3, False)
+    delivery.acknowledge(3)
+    assert {kind: state.t_ns for kind, state in delivery.states.items()} == {DaemonState: 2, Task: 3}
 
 
 def test_what_was_not_sent_is_not_confirmed():

@@ -1,5 +1,6 @@
 import io
 import json
+import os
 
 import pytest
 from mcap.reader import make_reader
@@ -7,6 +8,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from msgspec import structs
 
 from disco_hw.errors import InputError, LogError
+from disco_hw.files import LOG
 from disco_hw.log import Attachment, End
 from disco_hw.log.container import MAGIC
 from disco_hw.log.load import load_drive
@@ -187,6 +189,16 @@ def test_damage_inside_a_complete_log_costs_the_chunk(source, target):
     assert len({tick for _, _, tick, _ in entries(target)}) == 290
     with open_log(target) as log:
         assert log.summary().missing_ticks == 10
+
+
+def test_a_log_of_any_size_is_recovered(source, target):
+    source.write_bytes(COMPLETE_LOG)
+    os.truncate(source, LOG.most_bytes + 1)
+    with pytest.raises(InputError, match="too large to be a log"):
+        open_log(source)
+    assert recover_log(source, target).attachments == len(ATTACHMENTS)
+    with open_log(target) as log:
+        assert log.summary().ticks == 300
 
 
 def test_damage_between_the_chunks_costs_nothing(source, target, tmp_path):

@@ -7,12 +7,14 @@ from itertools import pairwise
 
 import pytest
 
+from disco_hw.daemon.run import close_recorder
 from disco_hw.errors import LogError
+from disco_hw.log import writer_link
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder, wall_offset_ns
 from disco_hw.log.reader import open_log
 from disco_hw.log.recorder import MemoryRecorder, NullRecorder, Recorder, RecorderStats
-from disco_hw.log.records import Event
+from disco_hw.log.records import BeliefChange, DaemonState, Event, Task
 from tests.log.processes import alive, drive, recorded_ticks, recording, size, wait_until
 from tools.log_samples import ATTACHMENTS, bits, tick
 
@@ -164,8 +166,20 @@ def test_a_file_deleted_while_it_is_written_is_reported_counted_and_begun_anew(p
     assert all_accounted(final, following - 1)
     assert recorded_ticks(recorder.path) == list(range(final.lost_ticks + 1, following))
     assert final.lost_ticks > 20
+    assert final.fault.startswith(f"{final.lost_ticks} of {following - 1} ticks are not in the log: ")
+    assert recorder.new_messages()[-1] == final.fault
     with open_log(recorder.path) as log:
         assert (log.metadata.continues, log.metadata.continues_sequence) == (str(path), final.lost_ticks)
+
+
+def test_a_log_deleted_before_its_end_is_not_complete_and_run_fails(path, recorder):
+    drive(recorder, 1, 5)
+    shutil.rmtree(path.parent)
+    said = []
+    with pytest.raises(LogError, match="the log is not complete"):
+        close_recorder(recorder, lambda topic, text: said.append((topic, text)))
+    assert [text for topic, text in said if topic == "recording" and "5 of 5 ticks are not in the log" in text]
+    assert recorder.poll().missing_ticks == 5
 
 
 def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on(path, recorder):
@@ -185,6 +199,111 @@ def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on
     final = recorder.close()
     assert (final.dropped_ticks, final.lost_ticks) == (0, 0)
     assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))
+
+
+def test_what_came_since_keeper_and_writer_died_while_armed_is_saved_at_the_end(path, recorder):
+    drive(recorder, 1, 5)
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
+    for process in (recorder.keeper_pid, recorder.writer_pid):
+        os.kill(process, signal.SIGKILL)
+    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+    final = recorder.close(60.0)
+    assert (final.delivered_ticks, final.missing_ticks, final.fault) == (following - 1, 0, "")
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))
+
+
+def test_a_keeper_that_cannot_be_made_at_the_end_is_reported_once(recorder, monkeypatch):
+    drive(recorder, 1, 5)
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
+    for process in (recorder.keeper_pid, recorder.writer_pid):
+        os.kill(process, signal.SIGKILL)
+    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+    recorder.new_messages()
+
+    def fail(*_, **__):
+        raise LogError("no process can be made")
+
+    monkeypatch.setattr(writer_link, "spawn_at_normal_priority", fail)
+    final = recorder.close(0.2)
+    assert final.waiting_ticks == following - 1 - final.delivered_ticks > 0
+    assert recorder.new_messages().count("no process can be made") == 1
+
+
+STATES_IN_FORCE = (
+    DaemonState(7, "READY", "BOOT"),
+    BeliefChange(7, "adapted", ("a",), (0.5,), (0.1,), "newer"),
+    Task(7, "circle", {"radius_m": 2.0}),
+)
+
+
+def in_several_parts(path, parts):
+    """A recorder whose files may have 60 kB, closed in the given part, and the number of ticks that it was given."""
+    recorder = ProcessRecorder(recording(path, part_bytes=60_000))
+    recorder.put(1, [*tick(1), BeliefChange(5, "model"), *STATES_IN_FORCE])
+    following = kept_going(recorder, 2, lambda _: recorder.path.name == f"run.part{parts}.mcap", period_s=0.001)
+    return recorder, following - 1
+
+
+def test_a_full_file_is_ended_and_the_log_goes_on_in_a_part_that_begins_with_what_is_in_force(path):
+    recorder, given = in_several_parts(path, 3)
+    final = recorder.close(60.0)
+    assert all_accounted(final, given)
+    assert (final.missing_ticks, final.writer_deaths, final.fault, recorder.new_messages()) == (0, 0, "", ())
+    files = [path, path.with_name("run.part2.mcap"), path.with_name("run.part3.mcap")]
+    ticks = [recorded_ticks(file) for file in files]
+    assert [k for held in ticks for k in held] == list(range(1, given + 1))
+    for before, file in pairwise(files):
+        assert size(before) >= 60_000
+        text = info(before, as_json=False)
+        assert "0 missing; ended properly as it was full; the next part continues it" in text
+        assert f"continues {before}" in info(file, as_json=False)
+    for file, held in zip(files, ticks, strict=True):
+        with open_log(file) as log:
+            summary = log.summary()
+            assert (log.complete, log.damage, summary.ended, summary.missing_ticks) == (True, (), True, 0)
+            assert summary.continued == (file != files[-1])
+            assert log.attachment_names() == tuple(kept.name for kept in ATTACHMENTS)
+            states = {type(entry.record): entry for entry in log.records(("/daemon/state", "/belief", "/task"))}
+            assert bits([states[type(state)].record for state in STATES_IN_FORCE]) == bits(STATES_IN_FORCE)
+            assert {entry.tick for entry in states.values()} == {held[0]}
+
+
+def test_without_a_keeper_a_full_file_is_not_ended(path):
+    recorder = ProcessRecorder(recording(path, part_bytes=1))
+    os.kill(recorder.keeper_pid, signal.SIGKILL)
+    wait_until(lambda: recorder.poll() and recorder.keeper_pid is None)
+    following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 20)
+    assert (recorder.close().fault, recorder.path) == ("", path)
+    assert recorded_ticks(path) == list(range(1, following))
+
+
+def test_a_writer_that_dies_while_it_ends_its_part_loses_nothing(path, monkeypatch):
+    """Even where the recorder does not know yet what that writer confirmed."""
+    recorder = ProcessRecorder(recording(path, part_bytes=30_000))
+    send_end = writer_link.WriterLine.send_end
+
+    def send_end_to_none(line, payload):
+        os.kill(recorder.writer_pid, signal.SIGKILL)
+        monkeypatch.setattr(writer_link.WriterLine, "send_end", send_end)
+        line.ending = True
+
+    monkeypatch.setattr(writer_link.WriterLine, "send_end", send_end_to_none)
+    following = kept_going_until_replaced(recorder, 1)
+    final = recorder.close(60.0)
+    assert all_accounted(final, following - 1)
+    assert final.missing_ticks == 0
+    assert {*recorded_ticks(path), *recorded_ticks(path.with_name("run.part2.mcap"))} >= set(range(1, 20))
+
+
+def test_close_while_a_part_ends_records_the_rest(path):
+    recorder = ProcessRecorder(recording(path, part_bytes=1))
+    drive(recorder, 1, 5)
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
+    # The next tick ends the part instead of being sent.
+    drive(recorder, 6, 5)
+    final = recorder.close(60.0)
+    assert (final.delivered_ticks, final.missing_ticks, final.writer_deaths) == (10, 0, 0)
+    assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, 11))
 
 
 def test_one_writer_after_the_other_may_die(path, recorder):

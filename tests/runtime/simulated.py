@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from msgspec import structs
+
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control.plan import PLANNER_VERSION
 from disco_hw.experiments.simulated_time import SimulatedRun, virtual_robot
@@ -78,11 +80,14 @@ def write_ticks(
     ticks: Iterable[tuple[int, Sequence[Record]]],
     files: Iterable[Attachment] = (),
     planner: int = PLANNER_VERSION,
+    part: int = 1,
+    continues_sequence: int | None = None,
 ) -> Path:
     """Write what a recorder was given as a log, in this process: starting another takes longer than a short log."""
     encode, number, now_ns = batch_encoder(), 0, 0
     with path.open("xb") as file:
-        log = McapLog(file, Start(str(path), "wombot", "", 0, 10**18, attachments=tuple(files), planner=planner))
+        begin = Start(str(path), "wombot", "", 0, 10**18, part, "run.mcap" * (part > 1), continues_sequence)
+        log = McapLog(file, structs.replace(begin, attachments=tuple(files), planner=planner))
         for number, (now_ns, records) in enumerate(ticks, start=1):
             log.write(encode(number, now_ns, records))
         log.end(End(now_ns, number, 0))

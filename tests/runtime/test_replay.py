@@ -36,14 +36,20 @@ def ticks():
 
 
 def write_log(
-    path: Path, ticks, robot: str | None = None, model: str | None = None, planner: int = PLANNER_VERSION
+    path: Path,
+    ticks,
+    robot: str | None = None,
+    model: str | None = None,
+    planner: int = PLANNER_VERSION,
+    part: int = 1,
+    continues_sequence: int | None = None,
 ) -> Path:
     texts = {
         ROBOT_TOML: robot or (ROBOTS / "wombot.toml").read_text(),
         MODEL_TOML: model or (ROBOTS / "wombot_model.toml").read_text(),
     }
     attachments = [Attachment(name, "application/toml", text.encode()) for name, text in texts.items()]
-    return write_ticks(path, ticks, attachments, planner)
+    return write_ticks(path, ticks, attachments, planner, part, continues_sequence)
 
 
 def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
@@ -163,6 +169,14 @@ def test_plans_of_a_later_planner_are_refused_with_the_version_that_has_it(tmp_p
     text = f"{log}: its plans are of planner version {PLANNER_VERSION + 1}, .* up to {PLANNER_VERSION}; replay it with"
     with pytest.raises(InputError, match=text):
         replay(log)
+
+
+def test_a_part_that_continues_another_is_refused_and_one_that_has_all_ticks_is_replayed(tmp_path, ticks):
+    log = write_log(tmp_path / "run.part2.mcap", ticks[100:200], part=2, continues_sequence=100)
+    with pytest.raises(InputError, match=rf"{log}: continues run\.mcap, and a replay needs .*; give the first part"):
+        replay(log)
+    # The first writer failed before it had a tick.
+    assert replay(write_log(tmp_path / "all.mcap", ticks[:20], part=2, continues_sequence=0)).ok
 
 
 def test_plans_that_were_refined_otherwise_are_refused_and_a_log_without_plans_is_replayed(tmp_path, ticks):
