@@ -310,6 +310,8 @@ class ScriptSource:
         past = self._script.manoeuvres[: self.finished]
         self._script = Script(self._script.name, (*past, *manoeuvres))
         self._driven_ns = math.ceil(math.fsum(one.duration_s for one in past) * 1e9)
+        # The time that the fit took is none of the manoeuvre's.
+        self._last_ns = None
 
     def poll(self, now_ns: int, robot: RobotView) -> ManualInput | None:
         """Return the script's wheel speeds with the other source's deadman and time."""

@@ -302,3 +302,14 @@ def test_a_script_that_the_fence_stops_ends_and_is_not_complete():
     assert not stopped.deadman
     assert playing.ended == "the fence stopped the script s in far; the event before this one says where"
     assert not playing.completed
+
+
+def test_a_manoeuvre_that_was_fitted_anew_begins_at_its_beginning_however_long_the_fit_took():
+    rising = Manoeuvre("rising", "for a test", 5.0, lambda t_s: (t_s, t_s))
+    playing = ScriptSource(Script("s", (straight("first"),)), AlwaysPressed())
+    view = RobotView(State.ARMED, True, pose=CENTER)
+    for tick in range(5):
+        playing.poll(tick * 20_000_000, view)
+    playing.replace_remaining((rising,))
+    assert playing.poll(200_000_000, view).left_rad_s == 0.0
+    assert playing.poll(220_000_000, view).left_rad_s == pytest.approx(0.02)
