@@ -129,8 +129,10 @@ class WheelResponse:
         lag_s = self.lag_s
         k, since_s = self._in_force(t_s)
         slow = lag_s * (1.0 - np.exp(-since_s / lag_s)) if lag_s > 0.0 else 0.0
-        # By sides: numpy is slow along an axis of two.
-        now, speed, angle = (each.T.take(k, axis=1) for each in (self.commanded, self.speed, self.angle))
+        # By sides: numpy is slow along an axis of two. Rows first: to take columns, it would copy a whole long log.
+        now, speed, angle = (
+            np.ascontiguousarray(each.take(k, axis=0).T) for each in (self.commanded, self.speed, self.angle)
+        )
         return np.asarray(angle + now * since_s + (speed - now) * slow)
 
 

@@ -24,6 +24,10 @@ Samples = TypeVar("Samples", Commands, Poses)
 Stamped = TypeVar("Stamped", Commands, Poses, Wheels)
 Columns = TypeVar("Columns", bound="DataclassInstance")
 
+# Chosen: those of half an hour; memory and time grow with their cube. Of a clock that drifts by 2 s, the most that is
+# plausible, each holds 13 ms.
+_MOST_STRETCHES = 150
+
 
 class Alignment(Protocol):
     """Samples beside the wheels: how old they are, all of them and in parts of the log (s), and how well that fits."""
@@ -180,9 +184,12 @@ def _squares(off_s: Array, far_s: float) -> float:
 
 
 def by_stretch(align: Alignment) -> tuple[Array, Array]:
-    """Middles of stretches of even length, and the age of the samples of each that shows one."""
+    """Middles of stretches of even length, and the age of the samples of each that shows one.
+
+    Of a long log the stretches are longer: there are `_MOST_STRETCHES` at most.
+    """
     first, last = align.span_s
-    count = max(int((last - first) / align.stretch_s), 1)
+    count = min(max(int((last - first) / align.stretch_s), 1), _MOST_STRETCHES)
     middles, delays = [], []
     for low, high in pairwise(np.linspace(first, last + 1e-6, count + 1).tolist()):
         delay_s = align.part_delay_s(low, high)
@@ -193,8 +200,14 @@ def by_stretch(align: Alignment) -> tuple[Array, Array]:
 
 
 def jump_instant(align: Alignment, sides: tuple[float, float], about_s: float) -> float:
-    """When samples jumped from one age to another, to a second: where both sides together fit best."""
-    reach = np.arange(about_s - align.stretch_s, about_s + align.stretch_s, 1.0)
+    """When samples jumped from one age to another: where both sides together fit best.
+
+    To a second; in a long log, whose stretches are so many times longer, to as many seconds.
+    """
+    first, last = align.span_s
+    times_longer = max((last - first) / (_MOST_STRETCHES * align.stretch_s), 1.0)
+    reach_s = times_longer * align.stretch_s
+    reach = np.arange(about_s - reach_s, about_s + reach_s, times_longer)
     costs = [
         align.part_mismatch(-np.inf, at_s, sides[0]) + align.part_mismatch(at_s, np.inf, sides[1])
         for at_s in reach.tolist()

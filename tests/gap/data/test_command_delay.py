@@ -1,5 +1,6 @@
 """The pieces of the commands' alignment with the wheels, each against what is computed by hand."""
 
+import tracemalloc
 from dataclasses import fields, replace
 
 import numpy as np
@@ -36,6 +37,19 @@ def answered(commands, lag_s, t_s):
 
 def commands_at(t_s, asked, segment=0):
     return Commands(np.asarray(t_s, dtype=float), *np.asarray(asked, dtype=float).T, np.full(len(t_s), segment))
+
+
+def test_angles_at_a_few_times_take_no_more_memory_from_a_log_of_hours():
+    count = 100_000
+    commands = commands_at(0.02 * np.arange(count), np.ones((count, 2)))
+    model = WheelResponse.of(commands, 0.3)
+    tracemalloc.start()
+    try:
+        model._angles(np.linspace(5.0, 15.0, 60))
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert peak_bytes < count
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.3])

@@ -229,6 +229,27 @@ def test_stretches_of_even_length_are_looked_at_one_by_one():
     assert len(by_stretch(Stamped((0.1,), span=5.0))[1]) == 1
 
 
+@pytest.mark.parametrize(("minutes", "stretches"), [(29, 145), (30, 150), (180, 150)])
+def test_stretches_of_a_log_of_hours_are_longer_as_their_cube_is_what_a_line_takes(minutes, stretches):
+    stamped = Stamped(900 * (0.1,), span=60.0 * minutes)
+    middles, _ = by_stretch(stamped)
+    assert len(middles) == len(stamped.asked) == stretches
+    # They still reach from the first sample to the last.
+    assert (stamped.asked[0][0], stamped.asked[-1][1]) == pytest.approx(stamped.span_s, abs=1e-5)
+
+
+def test_a_jump_in_a_log_of_hours_is_sought_as_far_as_its_stretches_reach_in_as_many_steps():
+    asked = []
+
+    def wrong(low_s, high_s, delay_s):
+        asked.append(delay_s)
+        return abs(high_s - 5070.0) if low_s == -np.inf else 0.0
+
+    # Stretches of 72 s, which are six times as long.
+    assert jump_instant(Stamped((), span=10800.0, wrong=wrong), (0.1, 0.4), 5007.0) == pytest.approx(5070.0, abs=3.0)
+    assert asked == 24 * [0.1, 0.4]
+
+
 def test_poses_of_a_stretch_are_those_stamped_in_it(monkeypatch):
     parts = []
     monkeypatch.setattr(timing, "pose_delay_s", lambda wheels, part, settings: parts.append(part) or 0.1 * len(parts))
