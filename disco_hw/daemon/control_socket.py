@@ -255,6 +255,12 @@ def _lock_path(path: Path) -> Path:
     return path.with_name(path.name + ".lock")
 
 
+def refuse_served(path: Path) -> None:
+    """Raise InputError if a daemon serves the socket at `path` now."""
+    if _lock_path(path).exists():
+        os.close(_lock(path))
+
+
 def _lock(path: Path) -> int:
     """Return the descriptor of the socket's lock file, locked; it holds this process's id, where there is room."""
     lock_path = _lock_path(path)

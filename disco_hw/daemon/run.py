@@ -32,7 +32,7 @@ from disco_hw.config import RobotConfig
 from disco_hw.control.plan import PLANNER_VERSION, Law
 from disco_hw.daemon import SERVED, describe_recording, passed_over, socket_path
 from disco_hw.daemon.check import refuse_other_host
-from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.daemon.control_socket import ControlServer, refuse_served
 from disco_hw.daemon.daemon import Daemon, Report
 from disco_hw.daemon.loop import MonotonicClock
 from disco_hw.daemon.page_feed import ViewerFeed, WatchedRecorder, feed_path, tick_feed_path
@@ -149,6 +149,8 @@ def serve(
     the system refuses now and may grant at another start: a port, an address, a log.
     """
     config, key, transport = setup.config, link_key(setup), create_link(setup)
+    # Before seconds of compilation; who comes at the same time is refused when the socket is made.
+    refuse_served(socket_path(config))
     # Before the signals are caught: whoever has enough of a compilation may break it off, as nothing is open yet.
     planner = compiled_elsewhere(lambda: warm_planner(setup, new_planner), describe_planner(setup), _progress)
     pipeline = create_pipeline(config, setup.model, planner)

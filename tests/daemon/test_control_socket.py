@@ -7,12 +7,13 @@ import stat
 import tempfile
 import time
 from contextlib import closing, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
 import pytest
 from hypothesis import strategies as st
 
-from disco_hw.daemon.control_socket import ControlServer
+from disco_hw.daemon.control_socket import ControlServer, refuse_served
 from disco_hw.errors import InputError
 from tests.tables import examples
 
@@ -350,13 +351,16 @@ def test_a_directory_that_is_a_link_or_a_file_is_refused(tmp_path):
 
 def test_a_living_daemon_is_not_displaced_and_what_a_killed_one_left_is_replaced(tmp_path):
     path = tmp_path / "robot.sock"
+    refuse_served(path)
     with serving_elsewhere(path) as process:
-        with pytest.raises(InputError, match=rf"already serves this socket \(process {process}\); stop it first"):
-            ControlServer(path, ACTIONS)
+        for refuse in (refuse_served, partial(ControlServer, actions=ACTIONS)):
+            with pytest.raises(InputError, match=rf"already serves this socket \(process {process}\); stop it first"):
+                refuse(path)
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
             client.connect(str(path))
         kill(process)
     assert path.is_socket()
+    refuse_served(path)
     with closing(ControlServer(path, ACTIONS)) as server:
         assert_takes_an_estop(server)
 
