@@ -186,7 +186,7 @@ def refusal(request: str, may_move: bool, age_ns: int) -> str | None:
             "not accepted from ROS 2, because any node in the domain could have sent it; set ros2.may_move = true in "
             "robot.toml, or use disco-hw ctl"
         )
-    if not -AHEAD_NS <= age_ns <= OLDEST_NS:
+    if abs(age_ns) > OLDEST_NS:
         return "sent over 1 s ago, or by another clock; synchronise the clocks, then send the request again"
     return None
 

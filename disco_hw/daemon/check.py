@@ -167,9 +167,13 @@ def refuse_while_daemon_runs(config: RobotConfig) -> None:
 def refuse_other_host(transport: Transport, driver: Driver) -> None:
     """Listen on the link for 0.3 s without sending; raise WorkError if another host speaks on it.
 
-    A daemon of another user, such as the service, has its control socket where this user does not look. `driver`: one
-    for this alone.
+    A daemon of another user, such as the service, has its control socket where this user does not look. A host that
+    says nothing, as a disarmed one of most vendors' controllers, is not heard. `driver`: one for this alone. A link
+    that is not up after 0.3 s is not waited for.
     """
+    start_ns = time.monotonic_ns()
+    while transport.state is not LinkState.UP and time.monotonic_ns() < start_ns + _OTHER_HOST_S * 1e9:
+        time.sleep(_STEP_S)
     start_ns = time.monotonic_ns()
     driver.link_up(start_ns)
     while (now_ns := time.monotonic_ns()) < start_ns + _OTHER_HOST_S * 1e9:

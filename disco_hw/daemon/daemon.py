@@ -115,7 +115,7 @@ class Daemon:
         self._notifier.stopping()
         if not self._failed:
             try:
-                self._until_stopped(lambda now_ns: self._core.tick(now_ns, (UserRequest.DISARM,)))
+                self._until_stopped(self._disarming_tick)
             except Exception:
                 # Even where the tick itself fails while stopping, the driver stops the robot before that is passed on.
                 self._until_stopped(self._stop_by_driver)
@@ -137,6 +137,12 @@ class Daemon:
                 return
             self._clock.sleep_until_ns(now_ns + period_ns)
         self._send_estop()
+
+    def _disarming_tick(self, now_ns: int) -> None:
+        """Have the core stop the robot; an e-stop is still accepted."""
+        messages = [message for message in self._server.poll() if message.action == UserRequest.ESTOP.value]
+        tick = self._core.tick(now_ns, (UserRequest.DISARM, *map(_request, messages)))
+        self._handle_messages(messages, tick.output.replies[1:])
 
     def _stop_by_driver(self, now_ns: int) -> None:
         """Have the driver alone stop the robot, as the rest of the loop has failed; by the e-stop if it cannot."""
@@ -258,6 +264,7 @@ class Daemon:
         restored = self._server.restore()
         if restored is None:
             return (counted,)
+        self._recorder.restore_feeds()
         self._report("control socket", restored)
         return counted, records.Event(now_ns, "warning", "control socket", restored)
 

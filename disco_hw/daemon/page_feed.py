@@ -86,6 +86,19 @@ class ViewerFeed:
         if self.watched and (self._pending or self._plan is not None):
             self._publish(now_ns)
 
+    def restore(self) -> None:
+        """Make the socket again where its file was removed; who was connected stays so."""
+        if self._path.exists():
+            return
+        mask = os.umask(0o177)
+        try:
+            self._socket.bind(f"ipc://{self._path}")
+        except zmq.ZMQError:
+            # Its directory is gone again; the next restoration of the control socket brings another try.
+            self.refused += 1
+        finally:
+            os.umask(mask)
+
     def close(self) -> None:
         """Disconnect everybody and remove the socket; safe to call twice."""
         if not self._socket.closed:
@@ -142,6 +155,11 @@ class WatchedRecorder:
     def announce(self, now_ns: int, wheels: Sequence[WheelSample]) -> None:
         """Show who wants each tick the wheels of one that is yet to be planned; `put` brings them again."""
         self._ticks.put(now_ns, wheels)
+
+    def restore_feeds(self) -> None:
+        """Make the feeds' sockets again where they were removed."""
+        self._feed.restore()
+        self._ticks.restore()
 
     def poll(self) -> RecorderStats:
         """Return the counters of the recorder."""

@@ -56,7 +56,7 @@ from disco_hw.runtime.core import FindsWiring, Pilot, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, NoPlanner, Off, Pipeline, Planner, Standstill
 from disco_hw.runtime.robot_setup import Setup, kept_files, link_key, load_setup, refuse_missing_effects, scene_of
 from drivers.kernel_cache import are_kernels_kept
-from drivers.types import PoseSample, Readings, WheelSample
+from drivers.types import Driver, PoseSample, Readings, Transport, WheelSample
 from firmware_protocol.codec import packaged_dbc
 
 
@@ -166,9 +166,8 @@ def serve(
             stop.add("tick feed", ticks.close)
             log = log_file or (new_log(config) if config.log.enabled else None)
             recorder = WatchedRecorder(_create_recorder(setup, log), feed, ticks)
-            if advice_style is not None and log is not None:
-                name = shlex.quote(str(log))
-                stop.add("log", lambda: report("log", f"look at it: disco-hw view {name}, or disco-hw log info {name}"))
+            if log is not None:
+                stop.add("log", lambda: _report_log(log, report if advice_style is not None else None))
             stop.add(_RECORDER, lambda: close_recorder(recorder, report))
             adaptation = create_fast_adaptation(setup, pipeline) if adapts else None
             for step in processes.enter_real_time(config.daemon.realtime_priority):
@@ -177,7 +176,7 @@ def serve(
                 report("control socket", line)
             transport.open()
             stop.add("link", transport.close)
-            refuse_other_host(transport, driver_of(config, key))
+            _refuse_beside_a_host(transport, driver_of(config, key))
             driver = driver_of(config, key)
             core = assemble_core(config, transport, driver, pipeline, recorder, pilot.needs_pose, adaptation)
             core.announce = recorder.announce
@@ -234,6 +233,29 @@ def _create_recorder(setup: Setup, log: Path | None) -> Recorder:
     except LogError as error:
         # No wrong file or option: a disk that is full now may have room at the next start.
         raise WorkError(str(error)) from None
+
+
+def _refuse_beside_a_host(transport: Transport, driver: Driver) -> None:
+    """Raise InputError if another host speaks on the link; with its exit code a service does not try again."""
+    try:
+        refuse_other_host(transport, driver)
+    except WorkError as refused:
+        raise InputError(str(refused)) from None
+
+
+def _report_log(log: Path, report: Report | None) -> None:
+    """Say how to look at a log; remove one without any record, as a start that fails again and again leaves them."""
+    from disco_hw.log.reader import open_log  # noqa: PLC0415
+
+    with contextlib.suppress(InputError):
+        with open_log(log) as opened:
+            is_empty = not opened.counts
+        if is_empty:
+            log.unlink()
+            return
+    if report is not None:
+        name = shlex.quote(str(log))
+        report("log", f"look at it: disco-hw view {name}, or disco-hw log info {name}")
 
 
 def close_recorder(recorder: Recorder, report: Report) -> None:

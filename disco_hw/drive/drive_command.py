@@ -117,11 +117,13 @@ def run_drive(options: DriveOptions, page_messages: Callable[[], tuple[str, ...]
                     errors.append(text)
                 show(topic, text)
 
-            serve(setup, log_file, report, HandPilot(source, coverage, page), page_messages=page_messages)
+            code = serve(setup, log_file, report, HandPilot(source, coverage, page), page_messages=page_messages)
     finally:
         source.close()
     # A writer that was slow for a second and then wrote all that had waited has lost nothing.
-    missing = () if not errors or _is_complete(log_file) else tuple(errors)
+    # The first file shows nothing of later parts; `serve` knows of all of them.
+    is_complete = not code and (not errors or _is_complete(log_file))
+    missing = () if is_complete else tuple(errors) or ("not every tick is in its file",)
     return DriveResult(
         log=log_file,
         ended=source.ended or "stopped on request",

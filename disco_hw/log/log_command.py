@@ -108,7 +108,7 @@ def _controller(record: Controller) -> str:
 def _describe_end(summary: LogSummary) -> str:
     """Describe in words whether the log ended properly."""
     if summary.ended and summary.continued and summary.complete:
-        return "ended properly as it was full; the next part continues it"
+        return "ended properly as it was full; what came after is in the next part"
     if summary.ended:
         return "ended properly" if summary.complete else "ended by its recorder, but the file is not whole"
     if summary.ended is None:

@@ -175,9 +175,12 @@ def test_nothing_is_sent_on_a_link_on_which_another_host_speaks(monkeypatch, tmp
     refusal = "another host speaks on this link: it sends HOST_STATE; stop it first"
     with pytest.raises(WorkError, match=refusal):
         check.run_check(ROBOT_FILE)
-    with pytest.raises(WorkError, match=refusal):
-        run.serve(load_setup(ROBOT_FILE), None, lambda topic, text: None, TaskPilot())
+    setup = load_setup(ROBOT_FILE)
+    with pytest.raises(InputError, match=refusal):
+        run.serve(setup, None, lambda topic, text: None, TaskPilot())
     assert not link.sent
+    # A service that starts again and again leaves no logs of nothing.
+    assert not list(tmp_path.rglob("*.mcap"))
 
 
 def test_a_model_that_run_refuses_fails():

@@ -15,7 +15,7 @@ from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from drivers.motor import find_driver
 from drivers.transport.inprocess import connect_pair
-from drivers.types import Frame, OutgoingFrame
+from drivers.types import DriverState, Frame, OutgoingFrame
 from sim.devices import find_controller
 from tests.drivers.motor.vendor_rig import START_NS, TICKS_PER_REV, VendorRig
 
@@ -27,6 +27,10 @@ SLOW = {"odrive": "stop_deceleration_rad_s2 = 4.0", "vesc": "stop_deceleration_r
 
 class Recorder(NullRecorder):
     watched = False
+    restored = 0
+
+    def restore_feeds(self):
+        self.restored += 1
 
 
 class Hand(TaskPilot):
@@ -179,6 +183,19 @@ def test_where_the_driver_fails_too_the_last_frames_are_those_of_an_emergency_st
     assert driven.rig.speed_rad_s < 0.05 * speed_rad_s
 
 
+def test_an_emergency_stop_is_accepted_while_they_stop(tmp_path):
+    driven, replies = Driven(tmp_path, "agilex"), []
+    driven.drive()
+    messages = [[], [SimpleNamespace(action="status"), SimpleNamespace(action="estop")]]
+    driven.daemon._server = SimpleNamespace(
+        poll=lambda: messages.pop() if messages else [], reply=lambda message, body: replies.append((message, body))
+    )
+    driven.daemon.stop_wheels()
+    ((message, body),) = replies
+    assert (message.action, body["ok"], driven.core.driver.state) == ("estop", True, DriverState.ESTOP)
+    assert driven.rig.speed_rad_s < 0.5
+
+
 def test_an_emergency_stop_goes_on_while_they_turn_where_they_brake_only_as_long_as_they_are_told_to(tmp_path):
     driven = Driven(tmp_path, "vesc", coasting_s=0.5)
     driven.drive()
@@ -196,3 +213,4 @@ def test_a_control_socket_that_was_removed_is_looked_for_every_second_and_record
     recorded = [*driven.daemon._every_second(1000 * MS), *driven.daemon._every_second(2000 * MS)]
     events = [(record.code, record.text) for record in recorded if type(record) is Event]
     assert events == [("control socket", "x.sock: was removed")]
+    assert driven.daemon._recorder.restored == 1

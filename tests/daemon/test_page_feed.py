@@ -172,6 +172,19 @@ def test_a_page_survives_the_daemons_restart(path):
     assert not path.exists()
 
 
+def test_a_socket_that_was_removed_is_made_again_for_its_owner_alone(feed, path):
+    path.unlink()
+    feed.restore()
+    assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0
+    with closing(FeedSubscriber(path)) as late:
+        connected(feed, late)
+    feed.restore()
+    path.unlink()
+    path.parent.rename(path.parent.with_name("gone"))
+    feed.restore()
+    assert feed.refused == 1
+
+
 def test_the_socket_is_its_owners_alone(feed, path):
     assert path.is_socket()
     assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0

@@ -97,6 +97,20 @@ def test_a_drive_whose_log_is_not_whole_is_not_completed(tmp_path, monkeypatch, 
     assert result.as_dict()["recording_errors"] == (() if is_complete else (notification[1],))
 
 
+def test_a_drive_of_whose_ticks_some_are_in_no_file_is_not_completed(tmp_path, monkeypatch):
+    """A full log goes on in another file, which may not have all that it should."""
+    log = tmp_path / "drive.mcap"
+
+    def served(_setup, path, _notify, _pilot, **_options):
+        write_ticks(path, map(tick_records, range(60)))
+        return 1
+
+    monkeypatch.setattr("disco_hw.drive.drive_command.serve", served)
+    result = run_drive(DriveOptions(write_robot_file(tmp_path), page=True, as_json=True, log_file=log))
+    assert not result.completed
+    assert "LOG NOT COMPLETE: not every tick is in its file" in result.as_text()
+
+
 @pytest.mark.parametrize("cut_off", [0, 40])
 def test_a_writer_that_was_slow_has_lost_nothing_where_the_log_proves_it(tmp_path, monkeypatch, cut_off):
     log = tmp_path / "drive.mcap"

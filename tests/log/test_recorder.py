@@ -255,7 +255,7 @@ def test_a_full_file_is_ended_and_the_log_goes_on_in_a_part_that_begins_with_wha
     for before, file in pairwise(files):
         assert size(before) >= 60_000
         text = info(before, as_json=False)
-        assert "0 missing; ended properly as it was full; the next part continues it" in text
+        assert "0 missing; ended properly as it was full; what came after is in the next part" in text
         assert f"continues {before}" in info(file, as_json=False)
     for file, held in zip(files, ticks, strict=True):
         with open_log(file) as log:
