@@ -4,8 +4,8 @@ A follower has the reference along the line, the place on it and the wheels of a
 Kanayama's, a linear-quadratic regulator) says how it turns. All laws act on the centre of rotation, which moves as a
 unicycle, beside the reference motion of `Reference`; the integral is of the tracked point's distance from the line.
 Gains are what a simplex search on five training robots found, at 0.2 m/s; faster robots have the same bandwidth in
-time, as their wheels change speed no sooner. Those of the regulator are chosen. `WithFallback` lets one take over for
-as long as DISCO finds nothing valid, where robot.toml asks for one.
+time, as their wheels change speed and answer no sooner. Those of the regulator are chosen. `WithFallback` lets one take
+over for as long as DISCO finds nothing valid, where robot.toml asks for one.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from disco_hw.tasks.line.course import SMALLEST_X_ICR_M, stable_yaw
 Array = NDArray[np.float64]
 
 GAINS_SPEED_M_S = 0.2
-"""Speed at which, and below which, the gains of pure pursuit and Kanayama's law hold as they stand."""
+"""Speed at which, and below which, the gains of the laws hold as they stand."""
 # Chosen: after a longer pause the integral goes on as if that much had passed.
 _LONGEST_GAP_S = 0.2
 
@@ -207,7 +207,7 @@ class Reference:
 class PurePursuit:
     """Turn towards the reference further on (Coulter 1992), and against the integral if any.
 
-    It looks `look_ahead_m` ahead, in proportion more above 0.2 m/s.
+    Above 0.2 m/s `look_ahead_m` is more in proportion to the speed, and `integral` less by its square.
     """
 
     look_ahead_m: float = 0.14
@@ -224,7 +224,7 @@ class PurePursuit:
         left = to_y * math.cos(yaw_rad) - to_x * math.sin(yaw_rad)
         arc = 2.0 * left / max(to_x * to_x + to_y * to_y, 1e-4)
         desired = float(reference.forward_m_s[errors.place]) * arc
-        desired -= self.integral * reference.speed_m_s * errors.sum_m_s
+        desired -= self.integral * reference.speed_m_s * errors.sum_m_s / faster**2
         return desired - float(reference.turn_rad_s[errors.place]), 1.0
 
 
@@ -253,7 +253,8 @@ class Kanayama:
 class LinearQuadratic:
     """State feedback of (integral, distance, yaw) that is optimal for these weights against turning, by length driven.
 
-    e' = yaw, yaw' = correction, sum' = e over the length, from the continuous Riccati equation.
+    e' = yaw, yaw' = correction, sum' = e over the length, from the continuous Riccati equation. Above 0.2 m/s these
+    are less by the first, second and third power of the speed, of yaw, distance and integral.
     """
 
     sum_weight: float = 100.0
@@ -274,8 +275,9 @@ class LinearQuadratic:
     def turn(self, reference: Reference, errors: Errors, x_m: float, y_m: float, yaw_rad: float) -> tuple[float, float]:
         """Return the gains times the state (rad/s), and the cosine of the heading error as speed factor."""
         integral, left, yaw = self.gains
-        length = reference.speed_m_s * errors.sum_m_s
-        correction = integral * length + left * errors.left_m + yaw * math.sin(errors.yaw_rad)
+        slower, length = min(GAINS_SPEED_M_S / reference.speed_m_s, 1.0), reference.speed_m_s * errors.sum_m_s
+        off = slower * integral * length + left * errors.left_m
+        correction = slower * (slower * off + yaw * math.sin(errors.yaw_rad))
         return -reference.speed_m_s * correction, max(math.cos(errors.yaw_rad), 0.2)
 
 

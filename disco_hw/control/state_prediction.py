@@ -95,7 +95,8 @@ class StatePrediction:
         settings, points, last = self._settings, self._points, state.sent[-1]
         sent = aims = last.left_rad_s, last.right_rad_s
         if points.model.effects and not settings.euler:
-            # Within a dead band wheels do not follow their command at all. The paper's mode stays as it is.
+            # Within a dead band wheels do not follow their command at all; what remembers commands counts as of a
+            # robot that stood. The paper's mode stays as it is.
             now = plain.RobotState(0.0, 0.0, 0.0, *wheels)
             aim_left, aim_right = plain.wheel_targets(points.mean, now, *sent, elapsed_s, settings.step_s)
             aims = float(aim_left), float(aim_right)

@@ -42,16 +42,18 @@ def test_a_slow_robot_plans_as_far_in_shorter_steps_where_its_plans_are_refined(
     [
         (Control(), 0.2, 0.238, 40),
         (Control(), 0.2, -2.0, 40),
-        (Control(), 0.2, 0.8, 100),
-        (Control(facing="backwards"), 0.2, -0.8, 100),
+        (Control(), 0.2, 0.24, 40),
+        (Control(), 0.2, 0.25, 50),
+        (Control(), 0.2, 0.8, 160),
+        (Control(facing="backwards"), 0.2, -0.8, 160),
         (Control(facing="backwards"), 0.2, 0.8, 40),
-        (Control(mode="sampled", step_s=0.2), 0.1, 0.5, 63),
+        (Control(mode="sampled", step_s=0.2), 0.1, 0.5, 100),
         (Control(), 0.05, 2.0, 500),
         (Control(horizon=20), 0.2, 0.8, 20),
         (Control(mode="paper"), 0.2, 0.8, 50),
     ],
 )
-def test_plans_cover_two_and_a_half_x_icr_where_the_tracked_point_lies_behind(control, speed_m_s, x_icr_m, horizon):
+def test_plans_cover_four_x_icr_where_the_tracked_point_lies_far_behind(control, speed_m_s, x_icr_m, horizon):
     assert DiscoSettings.from_config(control, speed_m_s, x_icr_m).sampler.horizon == horizon
 
 

@@ -103,8 +103,10 @@ def test_a_robot_whose_wheels_do_not_turn_as_commanded_drives_where_the_model_kn
 
 
 @pytest.mark.thorough
-def test_a_robot_whose_tracked_point_lies_far_behind_stays_on_its_circle():
+@pytest.mark.parametrize(("x_icr_m", "radius_m", "speed_m_s"), [(0.8, 2.0, 0.2), (1.2, 3.0, 0.5)])
+def test_a_robot_whose_tracked_point_lies_far_behind_stays_on_its_circle(x_icr_m, radius_m, speed_m_s):
     limits = {"max_wheel_speed_rad_s": 8.0, "max_wheel_acceleration_rad_s2": 20.0}
-    way_m, rms_m = driven((), Model(0.3, 2.0, 0.8), limits, CircleTask(radius_m=3.0), 60.0)
-    assert way_m > 0.9 * 0.2 * 60.0
+    task = CircleTask(radius_m=radius_m, speed_m_s=speed_m_s)
+    way_m, rms_m = driven((), Model(0.3, 2.0, x_icr_m), limits, task, 60.0)
+    assert way_m > 0.9 * speed_m_s * 60.0
     assert rms_m < 0.01

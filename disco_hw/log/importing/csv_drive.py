@@ -51,6 +51,8 @@ from disco_hw.log.importing.losses import share_note, warnings_first
 
 # Chosen: a median from sample to sample outside these is milliseconds or nanoseconds read as seconds.
 _LONGEST_PERIOD_S = 1.0
+# Chosen: longer than a slow receiver's, where positions are all that was measured; milliseconds are further apart.
+_LONGEST_POSITION_PERIOD_S = 10.0
 _SHORTEST_PERIOD_S = 1e-4
 # Chosen: of any robot's wheels; a factor of 10 or more from wrong units leaves this range, or that around the nominal
 # radius.
@@ -66,12 +68,12 @@ _LARGEST_TURN_RATIO = 3.0
 _LARGEST_YAW_RATE_RAD_S = 6.0
 
 
-def time_fault(t_s: Array) -> str | None:
+def time_fault(t_s: Array, longest_s: float = _LONGEST_PERIOD_S) -> str | None:
     """Describe the error in times of a signal that should be in seconds; None if there is none."""
     if t_s.size < 3:
         return None
     period_s = float(np.median(np.diff(t_s)))
-    if _SHORTEST_PERIOD_S <= period_s <= _LONGEST_PERIOD_S:
+    if _SHORTEST_PERIOD_S <= period_s <= longest_s:
         return None
     return f"t_s: {period_s:.3g} from sample to sample, which does not look like seconds; write seconds"
 
@@ -157,8 +159,10 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
             raise LogError(f"{path}: {fault}")
 
     # Rows of several signals may alternate, with the command in force in each: what was measured most shows the unit.
-    samples = [sheet.group(names)[1] for names in SIGNALS.values() if names != COMMAND]
-    refuse(time_fault(sheet.t_s[max(samples, key=np.count_nonzero)]))
+    samples = {names: sheet.group(names)[1] for names in SIGNALS.values() if names != COMMAND}
+    has_wheels = samples[SPEED].any() or samples[TICKS].any()
+    longest_s = _LONGEST_PERIOD_S if has_wheels else _LONGEST_POSITION_PERIOD_S
+    refuse(time_fault(sheet.t_s[max(samples.values(), key=np.count_nonzero)], longest_s))
     sheet, wheels = _wheels(sheet, ticks_per_rev, notes)
     t_s, segment = sheet.t_s, sheet.segment
     commands = _commands(sheet, notes)

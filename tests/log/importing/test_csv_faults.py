@@ -282,6 +282,18 @@ def test_an_export_has_the_same_commands_at_every_time(tmp_path, every):
     np.testing.assert_array_equal(known_commands(back, between_s), known_commands(drive, between_s))
 
 
+@pytest.mark.parametrize("period_s", [1.0, 1.25, 2.0])
+def test_positions_of_a_slow_receiver_are_in_seconds_where_they_are_all_that_was_measured(tmp_path, period_s):
+    rows = ["t_s,cmd_left_rad_s,cmd_right_rad_s,pose_x_m,pose_y_m"]
+    for k in range(400):
+        is_fix = k % round(20 * period_s) == 0
+        # Half a millisecond of jitter, in turn ahead and behind.
+        rows.append(f"{0.05 * k + 5e-4 * (k % 3)},2,3,{f'{0.01 * k},0' if is_fix else ','}")
+    path = tmp_path / "gps.csv"
+    path.write_text("\n".join(rows))
+    assert read_csv(path).poses.t_s.size == len(range(0, 400, round(20 * period_s)))
+
+
 @pytest.mark.parametrize("period_ms", [2, 50])
 def test_milliseconds_are_refused(tmp_path, period_ms):
     rows = [row | {"t_s": str(period_ms * k)} for k, row in enumerate(table())]
