@@ -115,7 +115,7 @@ class Daemon:
         self._notifier.stopping()
         if not self._failed:
             try:
-                self._until_stopped(self._disarming_tick)
+                self._until_stopped(self._disarming_tick, lambda: self._core.state not in IN_USE)
             except Exception:
                 # Even where the tick itself fails while stopping, the driver stops the robot before that is passed on.
                 self._until_stopped(self._stop_by_driver)
@@ -123,8 +123,8 @@ class Daemon:
             return
         self._until_stopped(self._stop_by_driver)
 
-    def _until_stopped(self, tick: Callable[[int], object]) -> None:
-        """Call `tick` with the time once a period until the driver's stop is over; send the e-stop if that fails."""
+    def _until_stopped(self, tick: Callable[[int], None], is_over: Callable[[], bool] = lambda: True) -> None:
+        """Call `tick` with the time once a period until the driver's stop `is_over`; send the e-stop if that fails."""
         core, limits = self._core, self._core.driver.limits
         ramp_s = 0.0
         if limits is not None:
@@ -133,7 +133,7 @@ class Daemon:
         period_ns = round(1e9 / core.config.control.rate_hz)
         while (now_ns := self._clock.now_ns()) < deadline_ns:
             tick(now_ns)
-            if core.driver.is_stop_over:
+            if core.driver.is_stop_over and is_over():
                 return
             self._clock.sleep_until_ns(now_ns + period_ns)
         self._send_estop()

@@ -151,6 +151,7 @@ def test_without_a_fault_they_stand_before_it_ends_however_fast_they_were(tmp_pa
     driven.drive()
     driven.daemon.stop_wheels()
     assert driven.rig.speed_rad_s < 0.5
+    assert driven.core.state is State.READY
 
 
 def test_after_a_failure_of_the_loop_the_driver_alone_brings_them_to_a_stand(tmp_path, name):
