@@ -288,10 +288,11 @@ def test_a_writer_that_dies_while_it_ends_its_part_loses_nothing(path, monkeypat
         line.ending = True
 
     monkeypatch.setattr(writer_link.WriterLine, "send_end", send_end_to_none)
-    following = kept_going_until_replaced(recorder, 1)
+    # Where all that was sent had been confirmed by then, its end is none of a writer that recorded.
+    following = kept_going(recorder, 1, lambda stats: recorder.path != path and stats.delivered_ticks > 20)
     final = recorder.close(60.0)
     assert all_accounted(final, following - 1)
-    assert final.missing_ticks == 0
+    assert (final.missing_ticks, final.writer_deaths <= 1) == (0, True)
     assert {*recorded_ticks(path), *recorded_ticks(path.with_name("run.part2.mcap"))} >= set(range(1, 20))
 
 
