@@ -68,6 +68,15 @@ def kept_going_until_replaced(recorder, first, deaths=1):
     return kept_going(recorder, first, lambda stats: not stats.fault)
 
 
+def kept_going_after_both_died(recorder):
+    """Go on until it is said that keeper and writer have died; returns the next number."""
+    drive(recorder, 1, 5)
+    wait_until(lambda: recorder.poll().waiting_ticks == 0)
+    for process in (recorder.keeper_pid, recorder.writer_pid):
+        os.kill(process, signal.SIGKILL)
+    return kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+
+
 def all_accounted(stats, given):
     """Every tick that was given is in exactly one place."""
     assert stats.ticks + stats.dropped_ticks == given
@@ -202,22 +211,14 @@ def test_a_keeper_that_died_is_made_again_while_disarmed_and_the_writer_lives_on
 
 
 def test_what_came_since_keeper_and_writer_died_while_armed_is_saved_at_the_end(path, recorder):
-    drive(recorder, 1, 5)
-    wait_until(lambda: recorder.poll().waiting_ticks == 0)
-    for process in (recorder.keeper_pid, recorder.writer_pid):
-        os.kill(process, signal.SIGKILL)
-    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+    following = kept_going_after_both_died(recorder)
     final = recorder.close(60.0)
     assert (final.delivered_ticks, final.missing_ticks, final.fault) == (following - 1, 0, "")
     assert recorded_ticks(path) + recorded_ticks(recorder.path) == list(range(1, following))
 
 
 def test_a_keeper_that_cannot_be_made_at_the_end_is_reported_once(recorder, monkeypatch):
-    drive(recorder, 1, 5)
-    wait_until(lambda: recorder.poll().waiting_ticks == 0)
-    for process in (recorder.keeper_pid, recorder.writer_pid):
-        os.kill(process, signal.SIGKILL)
-    following = kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+    following = kept_going_after_both_died(recorder)
     recorder.new_messages()
 
     def fail(*_, **__):
