@@ -42,9 +42,10 @@ LONGEST_STEP_S, LONGEST_REFINED_STEP_S = 0.25, USUAL_STEP_S
 FASTER_NOISE = 0.2
 # With the tracked point behind the centre of rotation an error of the heading grows e-fold over each x_icr of the way.
 # A plan that covers fewer x_icr than the first number leaves it to grow, and covers as many as the second instead.
-# Measured, with x_icr of 0.5 to 2 m on circles of 2 to 6 m: below 1.5 robots stayed up to 0.3 m off, with 2.5 some
-# stood still, with 3.3 all but the largest were within 0.1 mm of the circle, with 4 all.
+# Measured with refined plans, x_icr of 0.8 to 2 m, circles of 2 to 6 m: below 1.5 robots stayed up to 0.3 m off, with
+# 2.5 some stood still, with 3.3 all but the largest were within 0.1 mm of the circle, with 4 all.
 LEAST_WAY_X_ICR, WAY_X_ICR = 3.3, 4.0
+# As many as `horizon` in robot.toml may be.
 LONGEST_HORIZON = 500
 USUAL_WIDE = 3.0
 
