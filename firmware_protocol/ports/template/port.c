@@ -89,7 +89,7 @@ void port_measure(port_measurement_t *measurement)
         inputs->wheel_speed[side] = 0.0f; /* rad/s */
         inputs->current[side] = 0.0f;     /* A */
         inputs->temperature[side] = 25.0f;
-        inputs->encoder_valid[side] = false;
+        inputs->encoder_valid[side] = true; /* false: the board sees that the encoder fails; then ENCODER_MISSING */
     }
     inputs->voltage = 24.0f;
     inputs->estop_button = false; /* wired to the driver's enable line, too */

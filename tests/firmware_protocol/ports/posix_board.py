@@ -13,14 +13,18 @@ FIRMWARE, PORTS = PACKAGE / "firmware", PACKAGE / "ports"
 PORT = Path(__file__).with_name("posix_port.c")
 
 
+TEMPLATE = (str(PORTS / "template" / "port.c"), "-Wl,-z,muldefs")
+"""Options that leave to the template to measure and to drive; the rest stays that of the first port."""
+
+
 def build_board(folder, *options):
-    """Compile it with these options for the main loop; returns the program."""
+    """Compile it with these options for the compiler; returns the program."""
     program = folder / "board"
     sources = [PORTS / "controller.c", PORT, *(FIRMWARE / name for name in SOURCES)]
     if "-DDISCO_PLANT_LINE" in options:
         sources.append(PORTS / "plant_line.c")
-    flags = ["-std=gnu11", "-O1", "-Wall", "-Wextra", "-Werror", *options, f"-I{FIRMWARE}", f"-I{PORTS}"]
-    subprocess.run(["cc", *flags, *map(str, sources), "-lm", "-o", str(program)], check=True)
+    flags = ["-std=gnu11", "-O1", "-Wall", "-Wextra", "-Werror", f"-I{FIRMWARE}", f"-I{PORTS}"]
+    subprocess.run(["cc", *flags, *map(str, sources), *options, "-lm", "-o", str(program)], check=True)
     return program
 
 

@@ -74,8 +74,8 @@ uint64_t port_entropy(uint64_t *last)
     return entropy;
 }
 
-/* Wheels that follow at once, and drive nowhere. */
-void port_measure(port_measurement_t *measurement)
+/* Wheels that follow at once, and drive nowhere. Weak: those of another port take their place where both are linked. */
+__attribute__((weak)) void port_measure(port_measurement_t *measurement)
 {
     static float angle[2];
     const float speed[2] = {driven.left_setpoint, driven.right_setpoint};
@@ -88,7 +88,7 @@ void port_measure(port_measurement_t *measurement)
     }
 }
 
-void port_drive(const disco_outputs_t *outputs)
+__attribute__((weak)) void port_drive(const disco_outputs_t *outputs)
 {
     driven = *outputs;
 }

@@ -13,6 +13,7 @@ import pytest
 from firmware_protocol.build_firmware import PACKAGE
 from firmware_protocol.codec import Codec
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
+from tests.firmware_protocol.ports.posix_board import TEMPLATE
 from tests.tables import thinned
 
 PORTS = PACKAGE / "ports"
@@ -36,7 +37,8 @@ LINKS = {
     "serial": ((), encode_frame),
     "slcan": (("-DDISCO_LINK_SLCAN",), wire_text),
     "can": (("-DDISCO_LINK_CAN",), record),
-    "plant": (("-DDISCO_PLANT_LINE",), encode_frame),
+    "template": (TEMPLATE, encode_frame),
+    "plant": (("-DDISCO_PLANT_LINE", str(PORTS / "plant_line.c")), encode_frame),
 }
 
 
@@ -48,8 +50,8 @@ def board(compiled_core, tmp_path_factory):
     @cache
     def compiled(link):
         program = tmp_path_factory.mktemp(link) / "board"
-        sources = [PORTS / "controller.c", PORT, *([PORTS / "plant_line.c"] if link == "plant" else [])]
-        command = ["cc", *flags, "-std=c11", f"-I{PORTS}", *LINKS[link][0], *map(str, sources), *objects, "-lm"]
+        sources = [str(PORTS / "controller.c"), str(PORT), *LINKS[link][0]]
+        command = ["cc", *flags, "-std=c11", f"-I{PORTS}", *sources, *objects, "-lm"]
         subprocess.run([*command, "-o", str(program)], check=True)
         return program
 
@@ -138,3 +140,11 @@ def test_parameters_are_stored_when_they_change_and_not_each_time_they_are_writt
     output, _, stores = replay("serial", bytes(20_000) + received_bytes)
     assert [response["value"] for response in answers("serial", output, "PARAM_RESPONSE")] == values
     assert stores == 3
+
+
+def test_a_board_whose_wheels_are_not_measured_yet_has_no_fault(replay):
+    """As in steps 4 and 5 of docs/port.md: the conformance suite needs a robot in STANDBY."""
+    output, _, _ = replay("template", bytes(20_000))
+    states = answers("template", output, "SYSTEM_STATE")
+    assert states
+    assert {CODEC.choice_name("SYSTEM_STATE", "fault", state["fault"]) for state in states} == {"NONE"}
