@@ -1,10 +1,9 @@
-/* STM32F4 with ST's HAL: USART2 by DMA and interrupt, TIM2 as the microsecond counter, TIM3 and TIM4 as encoders, TIM1 as
- * the motors' PWM, IWDG. Compiled against stub headers in the tests; NOT RUN ON HARDWARE. The handles and the MX_..._Init
- * functions are what CubeMX generates for these peripherals. */
+/* STM32F4 with ST's HAL: USART2 by DMA, circular for reception, TIM2 as the microsecond counter, TIM3 and TIM4 as encoders,
+ * TIM1 as the motors' PWM, IWDG. Compiled against stub headers in the tests; NOT RUN ON HARDWARE. The handles and the
+ * MX_..._Init functions are what CubeMX generates for these peripherals. */
 #include "port.h"
 
 #include "main.h"
-#include "queue.h"
 
 #define TICKS_PER_REV (2048u)
 #define MAX_WHEEL_SPEED (8.0f)
@@ -13,28 +12,15 @@
 #define SPEED_FILTER_S (0.01f)
 #define RECORD_SECTOR FLASH_SECTOR_7
 #define RECORD_ADDRESS (0x08060000u)
+#define RECEIVING_BYTES (512u)
 #define SENDING_BYTES (256u)
 
-static disco_queue_t received;
-static uint8_t incoming;
+static volatile uint8_t incoming[RECEIVING_BYTES];
 static uint8_t sending[SENDING_BYTES];
 static uint16_t last_count[2];
 
 /* Memory that a reset leaves alone: the section .noinit of the linker script. */
 __attribute__((section(".noinit"))) static uint64_t last_entropy;
-
-/* Called by the HAL from the interrupt of USART2. */
-void HAL_UART_RxCpltCallback(UART_HandleTypeDef *uart)
-{
-    (void)disco_queue_put(&received, &incoming, 1u);
-    (void)HAL_UART_Receive_IT(uart, &incoming, 1u);
-}
-
-/* After an overrun the HAL has stopped receiving. */
-void HAL_UART_ErrorCallback(UART_HandleTypeDef *uart)
-{
-    (void)HAL_UART_Receive_IT(uart, &incoming, 1u);
-}
 
 disco_reset_cause_t port_start(disco_config_t *config)
 {
@@ -60,7 +46,13 @@ disco_reset_cause_t port_start(disco_config_t *config)
     (void)HAL_TIM_Encoder_Start(&htim4, TIM_CHANNEL_ALL);
     (void)HAL_TIM_PWM_Start(&htim1, TIM_CHANNEL_1);
     (void)HAL_TIM_PWM_Start(&htim1, TIM_CHANNEL_2);
-    (void)HAL_UART_Receive_IT(&huart2, &incoming, 1u);
+    /* Circular DMA, and no interrupt of its errors, at which the HAL would end it; the interrupt at the end of a burst
+     * wakes port_wait. Never HAL_UART_Receive_IT from an interrupt: it fails while HAL_UART_Transmit_DMA holds the lock. */
+    __disable_irq();
+    (void)HAL_UARTEx_ReceiveToIdle_DMA(&huart2, (uint8_t *)incoming, RECEIVING_BYTES);
+    __HAL_UART_DISABLE_IT(&huart2, UART_IT_ERR);
+    __HAL_UART_DISABLE_IT(&huart2, UART_IT_PE);
+    __enable_irq();
     MX_IWDG_Init(); /* LSI / 4, reload 249: 31 ms */
     config->ticks_per_rev = TICKS_PER_REV;
     config->max_wheel_speed = MAX_WHEEL_SPEED;
@@ -75,7 +67,14 @@ uint32_t port_now_us(void)
 
 size_t port_receive(uint8_t *bytes, size_t most)
 {
-    return disco_queue_take(&received, bytes, most);
+    static uint32_t taken;
+    const uint32_t written = (RECEIVING_BYTES - __HAL_DMA_GET_COUNTER(huart2.hdmarx)) % RECEIVING_BYTES;
+    size_t count = 0u;
+    while ((count < most) && (taken != written)) {
+        bytes[count++] = incoming[taken];
+        taken = (taken + 1u) % RECEIVING_BYTES;
+    }
+    return count;
 }
 
 size_t port_send(const uint8_t *bytes, size_t count)

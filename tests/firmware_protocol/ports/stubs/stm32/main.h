@@ -7,7 +7,9 @@ typedef enum { HAL_UART_STATE_READY = 0x20 } HAL_UART_StateTypeDef;
 typedef enum { GPIO_PIN_RESET = 0, GPIO_PIN_SET } GPIO_PinState;
 typedef struct { volatile uint32_t CNT; } TIM_TypeDef;
 typedef struct { TIM_TypeDef *Instance; } TIM_HandleTypeDef;
-typedef struct { volatile HAL_UART_StateTypeDef gState; } UART_HandleTypeDef;
+typedef struct { volatile uint32_t NDTR; } DMA_Stream_TypeDef;
+typedef struct { DMA_Stream_TypeDef *Instance; } DMA_HandleTypeDef;
+typedef struct { volatile HAL_UART_StateTypeDef gState; DMA_HandleTypeDef *hdmarx; } UART_HandleTypeDef;
 typedef struct { uint32_t ErrorCode; } RNG_HandleTypeDef;
 typedef struct { uint32_t Init; } IWDG_HandleTypeDef;
 typedef struct { uint32_t IDR; } GPIO_TypeDef;
@@ -39,6 +41,13 @@ void stub_clear_reset_flags(void);
 #define __HAL_TIM_GET_COUNTER(handle) ((handle)->Instance->CNT)
 void stub_compare(TIM_HandleTypeDef *timer, uint32_t channel, uint32_t value);
 #define __HAL_TIM_SET_COMPARE(handle, channel, value) stub_compare(handle, channel, value)
+#define __HAL_DMA_GET_COUNTER(handle) ((handle)->Instance->NDTR)
+#define UART_IT_PE (0x100U)
+#define UART_IT_ERR (0x200U)
+void stub_disable_interrupt(UART_HandleTypeDef *uart, uint32_t interrupt);
+#define __HAL_UART_DISABLE_IT(handle, interrupt) stub_disable_interrupt(handle, interrupt)
+void __disable_irq(void);
+void __enable_irq(void);
 #define FLASH_SECTOR_7 (7U)
 #define FLASH_TYPEPROGRAM_BYTE (0x00000000U)
 void __WFI(void);
@@ -56,10 +65,8 @@ HAL_StatusTypeDef HAL_Init(void);
 HAL_StatusTypeDef HAL_TIM_Base_Start(TIM_HandleTypeDef *timer);
 HAL_StatusTypeDef HAL_TIM_Encoder_Start(TIM_HandleTypeDef *timer, uint32_t channel);
 HAL_StatusTypeDef HAL_TIM_PWM_Start(TIM_HandleTypeDef *timer, uint32_t channel);
-HAL_StatusTypeDef HAL_UART_Receive_IT(UART_HandleTypeDef *uart, uint8_t *data, uint16_t size);
+HAL_StatusTypeDef HAL_UARTEx_ReceiveToIdle_DMA(UART_HandleTypeDef *uart, uint8_t *data, uint16_t size);
 HAL_StatusTypeDef HAL_UART_Transmit_DMA(UART_HandleTypeDef *uart, const uint8_t *data, uint16_t size);
-void HAL_UART_RxCpltCallback(UART_HandleTypeDef *uart);
-void HAL_UART_ErrorCallback(UART_HandleTypeDef *uart);
 HAL_StatusTypeDef HAL_RNG_GenerateRandomNumber(RNG_HandleTypeDef *rng, uint32_t *number);
 HAL_StatusTypeDef HAL_IWDG_Refresh(IWDG_HandleTypeDef *watchdog);
 GPIO_PinState HAL_GPIO_ReadPin(GPIO_TypeDef *port, uint16_t pin);
