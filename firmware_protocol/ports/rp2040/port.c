@@ -73,9 +73,10 @@ disco_reset_cause_t port_start(disco_config_t *config)
     irq_set_enabled(UART0_IRQ, true);
     uart_set_irq_enables(LINK, true, false);
     (void)add_repeating_timer_us(-1000, each_millisecond, NULL, &timer);
-    /* The RP2040 does not tell a brown-out from a power-on. */
-    const bool hung = watchdog_caused_reboot();
-    watchdog_enable(WATCHDOG_MS, true);
+    /* The RP2040 does not tell a brown-out from a power-on. Read before the watchdog is enabled, and not with
+     * watchdog_caused_reboot, which is true after each flashing, too. */
+    const bool hung = watchdog_enable_caused_reboot();
+    watchdog_enable(WATCHDOG_MS, false); /* not paused by the debugger: the PWM runs on */
     config->ticks_per_rev = TICKS_PER_REV;
     config->max_wheel_speed = MAX_WHEEL_SPEED;
     config->board_id = 0x2040u;

@@ -1,4 +1,4 @@
-"""What the skeletons ask of their vendors' libraries, whose functions do nothing here but print that they were called."""
+"""What the skeletons ask of their vendors' libraries, whose functions do nothing here but print their name."""
 
 import re
 import subprocess
@@ -17,10 +17,7 @@ def do_nothing(declaration):
     numbers = [each.split()[-1] for each in parameters.split(", ") if each != "void" and not set("*(") & set(each)]
     values = "".join(f", (long){number}" for number in numbers)
     ends = "" if result.strip() == "void" else " return 0;"
-    return (
-        f"{result}{name}({parameters}) "
-        f'{{ printf("{name}{" %ld" * len(numbers)}\\n"{values});{ends} }}\n'
-    )
+    return f'{result}{name}({parameters}) {{ printf("{name}{" %ld" * len(numbers)}\\n"{values});{ends} }}\n'
 
 
 @pytest.fixture
@@ -44,6 +41,12 @@ def calls(tmp_path):
     return run
 
 
+RP2040 = """
+uart_inst_t *const uart0;
+void quadrature_start(uint32_t encoder, uint32_t first_pin) {}
+int32_t quadrature_count(uint32_t encoder) { return 0; }
+"""
+ESP32 = "pcnt_unit_handle_t encoder_start(int side) { return NULL; }"
 STM32 = """
 static DMA_Stream_TypeDef stream;
 static DMA_HandleTypeDef reception = {&stream};
@@ -88,3 +91,9 @@ def test_the_stm32_receives_whatever_it_sends_meanwhile(calls):
     lines = calls("stm32", main, STM32)
     assert lines[-2:] == ["empty", ""]
     assert not {"wrong", *(line for line in lines if "bytes" in line)} & set(lines)
+
+
+def test_the_rp2040s_watchdog_runs_on_in_the_debugger_and_takes_no_flashing_for_a_hang(calls):
+    lines = calls("rp2040", "(void)port_start(&config);", RP2040)
+    asked = [line for line in lines if line.startswith("watchdog")]
+    assert asked == ["watchdog_enable_caused_reboot", "watchdog_enable 30 0"]

@@ -34,7 +34,7 @@ uint pwm_gpio_to_slice_num(uint pin);
 void pwm_set_wrap(uint slice, uint16_t wrap);
 void pwm_set_enabled(uint slice, bool enabled);
 void pwm_set_gpio_level(uint pin, uint16_t level);
-bool watchdog_caused_reboot(void);
+bool watchdog_enable_caused_reboot(void);
 void watchdog_enable(uint32_t delay_ms, bool pause_on_debug);
 void watchdog_update(void);
 uint64_t get_rand_64(void);
