@@ -27,7 +27,8 @@
 #define WATCHDOG_MS (50u)
 #define STANDARD_DATA (8u)
 
-enum { PIN_TX = 21, PIN_RX = 22, PIN_ENABLE = 25, PIN_BRAKE = 26, PIN_ESTOP = 27, PIN_LEFT_DIR = 32, PIN_RIGHT_DIR = 33 };
+enum { PIN_LEFT_PWM = 18, PIN_RIGHT_PWM = 19, PIN_TX = 21, PIN_RX = 22, PIN_ENABLE = 25, PIN_BRAKE = 26, PIN_ESTOP = 27,
+       PIN_LEFT_DIR = 32, PIN_RIGHT_DIR = 33 };
 
 int main(void); /* controller.c */
 void app_main(void);
@@ -50,6 +51,12 @@ void app_main(void)
 disco_reset_cause_t port_start(disco_config_t *config)
 {
     static const esp_task_wdt_config_t watchdog = {.timeout_ms = WATCHDOG_MS, .idle_core_mask = 0, .trigger_panic = true};
+    static const ledc_timer_config_t pwm = {.speed_mode = LEDC_LOW_SPEED_MODE, .duty_resolution = LEDC_TIMER_10_BIT,
+                                            .timer_num = LEDC_TIMER_0, .freq_hz = 20000, .clk_cfg = LEDC_AUTO_CLK};
+    static const ledc_channel_config_t motors[2] = {
+        {.gpio_num = PIN_LEFT_PWM, .speed_mode = LEDC_LOW_SPEED_MODE, .channel = LEDC_CHANNEL_0, .timer_sel = LEDC_TIMER_0},
+        {.gpio_num = PIN_RIGHT_PWM, .speed_mode = LEDC_LOW_SPEED_MODE, .channel = LEDC_CHANNEL_1, .timer_sel = LEDC_TIMER_0},
+    };
     const twai_general_config_t general = TWAI_GENERAL_CONFIG_DEFAULT(PIN_TX, PIN_RX, TWAI_MODE_NORMAL);
     const twai_timing_config_t timing = TWAI_TIMING_CONFIG_500KBITS();
     const twai_filter_config_t filter = TWAI_FILTER_CONFIG_ACCEPT_ALL();
@@ -60,6 +67,10 @@ disco_reset_cause_t port_start(disco_config_t *config)
     (void)gpio_set_direction(PIN_LEFT_DIR, GPIO_MODE_OUTPUT);
     (void)gpio_set_direction(PIN_RIGHT_DIR, GPIO_MODE_OUTPUT);
     (void)gpio_set_direction(PIN_ESTOP, GPIO_MODE_INPUT);
+    (void)gpio_set_pull_mode(PIN_ESTOP, GPIO_PULLUP_ONLY); /* pins 34 to 39 have none */
+    (void)ledc_timer_config(&pwm);
+    (void)ledc_channel_config(&motors[0]);
+    (void)ledc_channel_config(&motors[1]);
     encoders[0] = encoder_start(0);
     encoders[1] = encoder_start(1);
     (void)nvs_flash_init();
@@ -155,7 +166,7 @@ void port_measure(port_measurement_t *measurement)
             (void)twai_start();
         }
     }
-    inputs->estop_button = gpio_get_level(PIN_ESTOP) != 0; /* a broken wire stops */
+    inputs->estop_button = gpio_get_level(PIN_ESTOP) != 0; /* a broken wire stops: the button opens, the pull-up lifts */
 }
 
 static void drive_wheel(ledc_channel_t channel, int direction, float setpoint)

@@ -8,7 +8,6 @@ import pytest
 from tests.firmware_protocol.ports.test_ports import PORTS, STUBS, compiled
 
 HEADERS = {"stm32": "main.h", "rp2040": "pico/stdlib.h", "esp32": "esp_idf.h"}
-LINKS = {"esp32": ["-DDISCO_LINK_CAN"]}
 
 
 def do_nothing(declaration):
@@ -34,7 +33,7 @@ def calls(tmp_path):
             f"{''.join(stubs)}{definitions}\n"
             f"int main(void)\n{{\n    disco_config_t config;\n{main}\n    return 0;\n}}\n"
         )
-        options = [f"-I{STUBS / port}", f"-I{PORTS / port}", "-Wno-unused-parameter", *LINKS.get(port, [])]
+        options = [f"-I{STUBS / port}", f"-I{PORTS / port}", "-Wno-unused-parameter"]
         compiled(PORTS / port / "port.c", source, "-o", program, options=options)
         return subprocess.run([str(program)], capture_output=True, text=True, check=True, timeout=10).stdout.split("\n")
 
@@ -97,3 +96,9 @@ def test_the_rp2040s_watchdog_runs_on_in_the_debugger_and_takes_no_flashing_for_
     lines = calls("rp2040", "(void)port_start(&config);", RP2040)
     asked = [line for line in lines if line.startswith("watchdog")]
     assert asked == ["watchdog_enable_caused_reboot", "watchdog_enable 30 0"]
+
+
+def test_the_esp32_sees_a_broken_wire_and_has_its_motors_pwm(calls):
+    lines = calls("esp32", "(void)port_start(&config);", ESP32)
+    assert "gpio_set_pull_mode 27 0" in lines, "the pull-up of the e-stop button"
+    assert [line for line in lines if line.startswith("ledc")] == ["ledc_timer_config", *["ledc_channel_config"] * 2]
