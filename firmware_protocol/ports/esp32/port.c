@@ -1,7 +1,6 @@
-/* ESP32 with ESP-IDF 5 on a CAN bus (TWAI), which needs a transceiver: compile controller.c with -DDISCO_LINK_CAN and call
- * its main as a task pinned to a core, as app_main does here. Compiled against stub headers in the tests; NOT RUN ON
- * HARDWARE. */
-#define DISCO_LINK_CAN
+/* ESP32 with ESP-IDF 5 on a CAN bus (TWAI), which needs a transceiver: compile this and controller.c with
+ * -DDISCO_LINK_CAN, and call its main as a task pinned to a core, as app_main does here. Compiled against stub headers in
+ * the tests; NOT RUN ON HARDWARE. */
 #include "port.h"
 
 #include <string.h>

@@ -14,6 +14,8 @@ CONTRACT = (PORTS / "port.h").read_text("utf-8")
 STUBS = PORTS.parents[1] / "tests" / "firmware_protocol" / "ports" / "stubs"
 WARNINGS = ("-Wall", "-Wextra", "-Wdouble-promotion", "-Wstrict-prototypes", "-Werror", "-Wno-int-to-pointer-cast")
 SKELETONS = ("template", "stm32", "rp2040", "esp32")
+LINKS = {"esp32": ["-DDISCO_LINK_CAN"]}
+"""Flags without which a skeleton must not compile: the main loop needs the same."""
 AROUND_THE_BOARD = {"plant.c", "plant.h"}
 START_CODE = {"mps2": 80}
 """Where no vendor's library brings vectors, start code and memory map: lines for those."""
@@ -29,14 +31,13 @@ def functions(text):
 REQUIRED = functions(CONTRACT.replace(OPTIONAL, ""))
 
 
+def compile_c(*arguments, options=()):
+    command = ["cc", "-std=c11", *WARNINGS, *options, f"-I{FIRMWARE}", f"-I{PORTS}", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
 def compiled(*arguments, options=()):
-    include = [f"-I{FIRMWARE}", f"-I{PORTS}"]
-    ran = subprocess.run(
-        ["cc", "-std=c11", *WARNINGS, *options, *include, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    ran = compile_c(*arguments, options=options)
     assert ran.returncode == 0, ran.stderr
 
 
@@ -60,11 +61,20 @@ def test_a_port_is_the_contract_in_at_most_300_lines(port):
 
 
 @pytest.mark.parametrize(
-    ("port", "link"), [*((port, []) for port in SKELETONS), ("template", ["-DDISCO_LINK_CAN"])], ids=[*SKELETONS, "can"]
+    ("port", "link"),
+    [*((port, LINKS.get(port, [])) for port in SKELETONS), ("template", ["-DDISCO_LINK_CAN"])],
+    ids=[*SKELETONS, "can"],
 )
 def test_a_skeleton_compiles_against_what_its_vendor_declares(port, link, tmp_path):
     include = [f"-I{STUBS / port}", f"-I{PORTS / port}"]
     compiled("-c", PORTS / port / "port.c", "-o", tmp_path / "port.o", options=[*include, *link])
+
+
+def test_a_skeleton_for_a_bus_does_not_compile_for_the_serial_line_that_the_main_loop_would_take(tmp_path):
+    """The two would exchange a frame and bytes in one another's memory."""
+    tried = compile_c("-c", PORTS / "esp32" / "port.c", "-o", tmp_path / "port.o", options=[f"-I{STUBS / 'esp32'}"])
+    assert tried.returncode != 0
+    assert "port_receive" in tried.stderr
 
 
 @pytest.mark.parametrize(

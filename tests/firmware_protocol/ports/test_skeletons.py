@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from tests.firmware_protocol.ports.test_ports import PORTS, STUBS, compiled
+from tests.firmware_protocol.ports.test_ports import LINKS, PORTS, STUBS, compiled
 
 HEADERS = {"stm32": "main.h", "rp2040": "pico/stdlib.h", "esp32": "esp_idf.h"}
 
@@ -33,7 +33,7 @@ def calls(tmp_path):
             f"{''.join(stubs)}{definitions}\n"
             f"int main(void)\n{{\n    disco_config_t config;\n{main}\n    return 0;\n}}\n"
         )
-        options = [f"-I{STUBS / port}", f"-I{PORTS / port}", "-Wno-unused-parameter"]
+        options = [f"-I{STUBS / port}", f"-I{PORTS / port}", "-Wno-unused-parameter", *LINKS.get(port, [])]
         compiled(PORTS / port / "port.c", source, "-o", program, options=options)
         return subprocess.run([str(program)], capture_output=True, text=True, check=True, timeout=10).stdout.split("\n")
 
