@@ -10,8 +10,6 @@
 #define TWO_PI (6.2831853f)
 #define PWM_FULL (1000.0f)
 #define SPEED_FILTER_S (0.01f)
-#define RECORD_SECTOR FLASH_SECTOR_7
-#define RECORD_ADDRESS (0x08060000u)
 #define RECEIVING_BYTES (512u)
 #define SENDING_BYTES (256u)
 
@@ -147,23 +145,15 @@ void port_feed_watchdog(void)
 
 bool port_load(uint8_t *record)
 {
-    const uint8_t *stored = (const uint8_t *)(uintptr_t)RECORD_ADDRESS;
-    for (uint8_t i = 0u; i < (uint8_t)DISCO_RECORD_LENGTH; i++) {
-        record[i] = stored[i];
-    }
-    /* Erased flash is no record: its CRC does not hold. */
-    return true;
+    (void)record;
+    return false;
 }
 
-/* Erasing takes longer than the watchdog allows, and stops all code in the same bank: the watchdog's reset after it is
- * told as such. Keep the record in an EEPROM or FRAM, or erase at the start. Written here only into erased flash. */
+/* Parameters last until the next start. To erase flash takes longer than the watchdog allows and stops all code in the same
+ * bank, and a record written over another one is neither of the two: keep it in an EEPROM or FRAM. */
 void port_store(const uint8_t *record)
 {
-    (void)HAL_FLASH_Unlock();
-    for (uint32_t i = 0u; i < (uint32_t)DISCO_RECORD_LENGTH; i++) {
-        (void)HAL_FLASH_Program(FLASH_TYPEPROGRAM_BYTE, RECORD_ADDRESS + i, record[i]);
-    }
-    (void)HAL_FLASH_Lock();
+    (void)record;
 }
 
 void port_wait(void)

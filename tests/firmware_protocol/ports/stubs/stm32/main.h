@@ -48,8 +48,6 @@ void stub_disable_interrupt(UART_HandleTypeDef *uart, uint32_t interrupt);
 #define __HAL_UART_DISABLE_IT(handle, interrupt) stub_disable_interrupt(handle, interrupt)
 void __disable_irq(void);
 void __enable_irq(void);
-#define FLASH_SECTOR_7 (7U)
-#define FLASH_TYPEPROGRAM_BYTE (0x00000000U)
 void __WFI(void);
 void SystemClock_Config(void);
 void MX_GPIO_Init(void);
@@ -71,7 +69,4 @@ HAL_StatusTypeDef HAL_RNG_GenerateRandomNumber(RNG_HandleTypeDef *rng, uint32_t 
 HAL_StatusTypeDef HAL_IWDG_Refresh(IWDG_HandleTypeDef *watchdog);
 GPIO_PinState HAL_GPIO_ReadPin(GPIO_TypeDef *port, uint16_t pin);
 void HAL_GPIO_WritePin(GPIO_TypeDef *port, uint16_t pin, GPIO_PinState state);
-HAL_StatusTypeDef HAL_FLASH_Unlock(void);
-HAL_StatusTypeDef HAL_FLASH_Lock(void);
-HAL_StatusTypeDef HAL_FLASH_Program(uint32_t type, uint32_t address, uint64_t data);
 #endif
