@@ -48,6 +48,7 @@ from drivers.types import (
     ReceivedFrame,
     RobotStatus,
     Transport,
+    WheelSample,
 )
 from firmware_protocol import status_codes
 from firmware_protocol.codec import Codec, Decoded
@@ -119,6 +120,8 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
                 checks.append(_hearing_check(found))
                 checks.append(check_round_trip(found.round_trips_s, 1.0 / control.rate_hz))
             checks.append(_telemetry_check(found))
+            if found.wheels:
+                checks.append(_wheels_check(found.wheels))
             checks += pose_source_checks(setup.config.pose, found.poses)
             limits = found.driver.limits
             if limits is not None:
@@ -137,7 +140,7 @@ class _Found:
 
     driver: Driver
     detail: str
-    wheel_samples: int
+    wheels: tuple[WheelSample, ...]
     poses: tuple[PoseSample, ...]
     pose_message: str
     rejected: int
@@ -225,7 +228,7 @@ def _link_check(transport: Transport) -> Check:
 def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
     """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
     stopwatch = _Stopwatch()
-    wheels = 0
+    wheels: list[WheelSample] = []
     poses: list[PoseSample] = []
     pose_message = ""
     reported: list[RobotStatus] = []
@@ -238,7 +241,7 @@ def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) 
         frames = transport.receive()
         stopwatch.received(frames)
         readings = driver.receive(now_ns, frames)
-        wheels += len(readings.wheels)
+        wheels += readings.wheels
         came = pose_source.receive(now_ns, readings.poses)
         poses += came
         if isinstance(pose_source, MessageSource):
@@ -252,7 +255,7 @@ def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) 
     return _Found(
         driver=driver,
         detail=connection(transport.state, transport.last_error, driver.state, driver.detail),
-        wheel_samples=wheels,
+        wheels=tuple(wheels),
         poses=tuple(poses),
         pose_message=pose_message,
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
@@ -364,8 +367,8 @@ def _hearing_check(found: _Found) -> Check:
 def _telemetry_check(found: _Found) -> Check:
     """Fail without wheel samples; warn without poses or heading, or if frames were rejected."""
     name = "telemetry"
-    rates = f"{found.wheel_samples / _LISTEN_S:.0f} wheel and {len(found.poses) / _LISTEN_S:.0f} pose samples a second"
-    if not found.wheel_samples:
+    rates = f"{len(found.wheels) / _LISTEN_S:.0f} wheel and {len(found.poses) / _LISTEN_S:.0f} pose samples a second"
+    if not found.wheels:
         return Check(name, Level.FAIL, f"{rates}; check the encoders and the firmware")
     if not found.poses:
         why = found.pose_message and f"; {found.pose_message}"
@@ -383,3 +386,17 @@ def _telemetry_check(found: _Found) -> Check:
             f"{rates}, {found.rejected} frames rejected; check the cable, and look for other senders",
         )
     return Check(name, Level.OK, f"{rates}, none rejected")
+
+
+def _wheels_check(samples: Sequence[WheelSample]) -> Check:
+    """Report how far and how fast each wheel turned, for an operator who turns it by hand."""
+    sides = [
+        ("left", [(sample.left_angle_rad, sample.left_speed_rad_s) for sample in samples]),
+        ("right", [(sample.right_angle_rad, sample.right_speed_rad_s) for sample in samples]),
+    ]
+    texts = [
+        f"{side} turned by {turned[-1][0] - turned[0][0]:+.2f} rad, at most at "
+        f"{max((speed for _, speed in turned), key=abs):+.2f} rad/s"
+        for side, turned in sides
+    ]
+    return Check("wheels", Level.OK, "; ".join(texts))

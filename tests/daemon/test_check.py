@@ -18,7 +18,7 @@ from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import create_driver
 from drivers.pose.robot import RobotPoses
 from drivers.transport import connect_pair
-from drivers.types import Frame, LinkState, OutgoingFrame, PoseSample, ReceivedFrame
+from drivers.types import Frame, LinkState, OutgoingFrame, PoseSample, ReceivedFrame, WheelSample
 from firmware_protocol.codec import Codec
 from firmware_protocol.status_codes import FAULTS
 from tests.daemon.control_daemon import ControlDaemon
@@ -123,6 +123,21 @@ def test_poses_without_heading_or_none_at_all_are_a_warning_with_the_reason(sile
     reported = check._telemetry_check(query(RobotInTime(b""), poses=Antenna(silent)))
     assert reported.level is Level.WARNING
     assert expected_text in reported.text
+
+
+def test_wheels_that_are_turned_by_hand_show_their_side_sign_and_size():
+    samples = [WheelSample(i, i, 5.0 + i, 1.0 - 0.5 * i, (0.0, 3.0, 1.0)[i], (0.0, -1.5, 0.0)[i]) for i in range(3)]
+    reported = check._wheels_check(samples)
+    assert (reported.level, reported.text) == (
+        Level.OK,
+        "left turned by +2.00 rad, at most at +3.00 rad/s; right turned by -1.00 rad, at most at -1.50 rad/s",
+    )
+
+
+def test_what_the_wheels_do_is_heard_while_the_check_listens():
+    robot = RobotInTime(b"")
+    robot.robot.pushed = 2.0
+    assert check._wheels_check(query(robot).wheels).text.count("at most at +2.00 rad/s") == 2
 
 
 def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):

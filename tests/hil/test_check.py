@@ -25,6 +25,7 @@ def assert_check_passes(robot_file) -> None:
     assert levels["firmware limits"] == "ok"
     assert levels["link load"] == "ok"
     assert "median" in next(check["text"] for check in report["checks"] if check["name"] == "round trip")
+    assert levels["wheels"] == "ok"
     telemetry = next(check["text"] for check in report["checks"] if check["name"] == "telemetry")
     wheels, poses = map(int, re.findall(r"\d+", telemetry)[:2])
     assert 90 <= wheels <= 101
