@@ -89,7 +89,7 @@ def test_every_figure_in_words_has_its_day_and_a_command_that_is_there(row):
     assert re.match(r"\d+ \w{3} `[0-9a-f]{7}`", noted), what
     gone = re.findall(r"`(tools/[\w/]+\.py)[^`]*` of `[0-9a-f]{7}`", shown_by)
     assert not [tool for tool in gone if (results.ROOT / tool).exists()], what
-    commands = [] if gone else re.findall(r"`([^`]+)`", shown_by)
+    commands = [] if gone else re.findall(r"`([^`]+)`", re.sub(r" of `[0-9a-f]{7}`", "", shown_by))
     assert commands or gone, what
     targets = set(re.findall(r"^([a-z][\w\-]*):", (results.ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
     for command in commands:
