@@ -30,7 +30,6 @@ PARTS = (
     "bench_inference",
     "bench_latency",
     "bench_log",
-    "bench_loop",
     "bench_start",
     "bench_tracking",
     "bench_viewer",
