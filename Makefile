@@ -121,7 +121,6 @@ fault-campaign: $(STAMP)
 PROPERTY_TESTS = $$(grep -rl hypothesis tests --include=test_*.py)
 fuzz: $(STAMP)
 	$(BIN)/python -m tools.check.fuzz
-	$(BIN)/python -m tools.check.fuzz_wire
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --hypothesis-profile=search $(PROPERTY_TESTS)
 
 firmware-check: $(STAMP)
