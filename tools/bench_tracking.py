@@ -9,15 +9,16 @@ way-points by time, of which the distance from the line is shown. With `--slope 
 robots of `tools/foreign_plant.py` by so much (m/s).
 
 `python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it.
-`... --first 5000 --count 20` drives robots that nothing was chosen on, `--speeds 0.1,0.2,0.3` at these speeds (m/s).
-`nmpc` is a textbook nonlinear MPC (`tools/nmpc.py`, of [bench]). `forward` is the part of the time in which a robot
-moves forward: nothing in the cost of that MPC asks for it. `nmpc_forward` is the same MPC, which may not drive
-backwards.
+`... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
+and `--json` prints the figures as JSON. `nmpc` is a textbook nonlinear MPC (`tools/nmpc.py`, of [bench]). `forward` is
+the part of the time in which a robot moves forward: nothing in the cost of that MPC asks for it. `nmpc_forward` is the
+same MPC, which may not drive backwards.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -136,15 +137,22 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--first", type=int, default=FIRST, help="the first robot's number")
     parser.add_argument("--speeds", default=str(SPEED_M_S), help="speeds of the tracks (m/s), comma-separated")
     parser.add_argument("--slope", type=float, default=0.0, help="how fast the ground carries the robots (m/s)")
+    parser.add_argument("--json", action="store_true", help="print one JSON object of all figures at the end")
     options = parser.parse_args(arguments)
     names, ways = options.names.split(","), options.ways.split(",")
     if options.slope and any(name.startswith(MUJOCO) for name in names):
         parser.error("--slope: the robot in MuJoCo stands on level ground")
     count = options.count or int(options.robots or 6)
-    for speed in map(float, options.speeds.split(",")):
-        for key, drives in rows(count, tuple(names), tuple(ways), options.first, speed, options.slope):
-            found = (f"{field} {value:.3g} " for field, value in figures_of(drives).items())
-            print(f"{f'{key}.{speed:g}':45}", *found, flush=True)
+    figures: dict[str, float] = {}
+    for speed in options.speeds.split(","):
+        for key, drives in rows(count, tuple(names), tuple(ways), options.first, float(speed), options.slope):
+            found = figures_of(drives)
+            named = f"{key}.{float(speed):g}"
+            figures |= {f"{named}.{field}": value for field, value in found.items()}
+            if not options.json:
+                print(f"{named:45}", *(f"{field} {value:.3g} " for field, value in found.items()), flush=True)
+    if options.json:
+        print(json.dumps(figures, indent=2))
 
 
 if __name__ == "__main__":
