@@ -1,7 +1,8 @@
-"""Inference on simulated drives of about two minutes: time, error, width and calibration."""
+"""Inference on simulated drives of about two minutes: time, error, width, calibration, and sbi's NPE beside it."""
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from time import perf_counter
 
 import numpy as np
@@ -9,11 +10,12 @@ import numpy as np
 from disco_hw.config import Robot, RobotConfig
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
-from disco_hw.inference.infer import infer, noise_of
+from disco_hw.inference.infer import Inference, infer, noise_of
 from disco_hw.inference.simulate import NAMES, Simulator, draw_seeds
 from disco_hw.log.drive import DriveLog
 from disco_hw.model import Model
 from sim.plant_parameters import PlantParameters
+from tools.bench.sbi_scores import PEERS, paired, scores
 from tools.simulated_drives import create_drive
 from tools.simulated_log import read_back, simulated_log
 
@@ -54,6 +56,22 @@ def run() -> dict[str, float]:
             found[f"{key}.{name}.error"] = float(abs(result.draws[:, index].mean() - truth[index]))
             found[f"{key}.{name}.width"] = float(result.draws[:, index].std() / reference[index])
             found[f"{key}.{name}.sbc_p"] = float(result.calibration.p_values[index])
+        found |= {f"{key}.{name}": score for name, score in log_scores(result).items()}
+    return found
+
+
+def log_scores(result: Inference) -> dict[str, float]:
+    """Mean log scores of the posteriors on fresh simulations (`tools.bench.sbi_scores`): ours, and how far it is ahead.
+
+    Ahead of sbi's, with the standard error, also before the posteriors are cut to their region. Without sbi only ours.
+    """
+    peers = PEERS if find_spec("sbi") else ()
+    given = scores(result, peers)
+    found = {"log_score": float(given["ours"].mean())}
+    for peer in peers:
+        for kind in ("", "_raw"):
+            ahead, error = paired(given[f"ours{kind}"], given[f"{peer}{kind}"])
+            found |= {f"ahead_of_sbi_{peer}{kind}": ahead, f"ahead_of_sbi_{peer}{kind}.error": error}
     return found
 
 
