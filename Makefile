@@ -64,8 +64,7 @@ cross-tools:
 
 # The firmware on an emulated Cortex-M3 and M4F: what it costs there, and what holds of it over its serial line.
 firmware-emulated: $(STAMP) cross-tools
-	$(BIN)/python -m tools.generate.firmware_figures --check
-	$(BIN)/python -m pytest -n 0 -rs -m long tests/firmware_protocol/emulated
+	$(BIN)/python -m pytest -n 0 -rs -m long tests/firmware_protocol/emulated tests/firmware_protocol/ports/test_figures.py
 
 # Real ROS 2, 230 MB, in an environment of its own. Its wheels are not made for each Python; without them its tests are
 # skipped.
@@ -121,7 +120,6 @@ fault-campaign: $(STAMP)
 PROPERTY_TESTS = $$(grep -rl hypothesis tests --include=test_*.py)
 fuzz: $(STAMP)
 	$(BIN)/python -m tools.check.fuzz
-	$(BIN)/python -m tools.check.fuzz_wire
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --hypothesis-profile=search $(PROPERTY_TESTS)
 
 firmware-check: $(STAMP)

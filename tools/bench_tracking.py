@@ -8,7 +8,7 @@ their back as their front (`turned_robot`), as the MPC drives them. Ways that be
 way-points by time, of which the distance from the line is shown. With `--slope 0.03` the ground carries the moving
 robots of `tools/foreign_plant.py` by so much (m/s).
 
-`python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it; `... starts 20` begins anywhere.
+`python -m tools.bench_tracking disco_adapting circle,square 20` drives some of it.
 `... --first 5000 --count 20` drives robots that nothing was chosen on; `--speeds 0.1,0.2,0.3` at these speeds (m/s),
 and `--json` prints the figures as JSON. `nmpc` is a textbook nonlinear MPC (`tools/nmpc.py`, of [bench]). `forward` is
 the part of the time in which a robot moves forward: nothing in the cost of that MPC asks for it. `nmpc_forward` is the
@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -27,13 +26,13 @@ from functools import partial
 
 import numpy as np
 
-from disco_hw.control import Disco, DiscoSettings, PlannerState, SentCommand
+from disco_hw.control import DiscoSettings
 from disco_hw.control.baselines import Kanayama, LinearQuadratic, PurePursuit
 from disco_hw.runtime.pipeline import Planner
-from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots, turned_robot
+from tools.foreign_plant import ForeignPlant, ForeignRobot, robots, turned_robot
 from tools.mujoco_plant import mujoco_plant, mujoco_robots
 from tools.nmpc import NonlinearMpc
-from tools.tracking import LIMITS, Contender, Drive, Track, classical, disco, drive, model, timed, tracks
+from tools.tracking import Contender, Drive, Track, classical, disco, drive, timed, tracks
 
 FIRST = 1000
 SPEED_M_S, RATE_HZ = 0.2, 50.0
@@ -125,71 +124,13 @@ def run(count: int = 20) -> dict[str, float]:
         f"{key}.{field}": value
         for key, drives in rows(count, tuple(contenders()), tuple(tracks(SPEED_M_S)))
         for field, value in figures_of(drives).items()
-    } | starts(count)
-
-
-ON_THE_LINE_M, STAYS_S, SPARE_S, AROUND_M = 0.05, 3.0, 10.0, 1.0
-STARTS_RATE_HZ = 25.0
-STARTED_WAYS = ("circle", "eight", "square")
-
-
-def starts(count: int = 200, ways: tuple[str, ...] = STARTED_WAYS) -> dict[str, float]:
-    """Random poses within AROUND_M of a line, the true pose given to the planner, with and without a dead band.
-
-    Seconds from the straight way to the line, at the task's speed, to the begin of STAYS_S within ON_THE_LINE_M of it,
-    driven forwards; and how many were later than SPARE_S, or went along the line backwards.
-    """
-    figures: dict[str, float] = {}
-    for way in ways:
-        for dead_rad_s in (0.0, 0.8):
-            robot = ForeignRobot(*NOMINAL, dead_rad_s=dead_rad_s)
-            track = tracks(SPEED_M_S)[way]
-            planner = Disco(
-                model(robot, True), track.task, DiscoSettings.for_speed(SPEED_M_S, STARTS_RATE_HZ), LIMITS, 1
-            )
-            found = [_arrival_s(planner, robot, track, seed) for seed in range(count)]
-            delay_s = np.array([delay_s for delay_s, _ in found])
-            figures |= {
-                f"starts.{way}.dead_{dead_rad_s:g}.late_median_s": float(np.median(delay_s)),
-                f"starts.{way}.dead_{dead_rad_s:g}.late_worst_s": float(delay_s.max()),
-                f"starts.{way}.dead_{dead_rad_s:g}.lost": float((delay_s > SPARE_S).sum()),
-                f"starts.{way}.dead_{dead_rad_s:g}.backwards": float(sum(backwards for _, backwards in found)),
-            }
-    return figures
-
-
-def _arrival_s(planner: Disco, robot: ForeignRobot, track: Track, seed: int) -> tuple[float, bool]:
-    """Seconds beyond the straight way to the line, at most twice SPARE_S; whether it went along the line backwards."""
-    rng = np.random.default_rng([seed, 99])
-    low, high = track.points_m.min(axis=0) - AROUND_M, track.points_m.max(axis=0) + AROUND_M
-    x_m, y_m = rng.uniform(low, high).tolist()
-    plant = ForeignPlant(robot, (x_m, y_m, float(rng.uniform(-math.pi, math.pi))), seed)
-    way_s = abs(float(track.course.off_m(np.array([[x_m, y_m]]))[0])) / SPEED_M_S
-    planner.reset()
-    period_ms = round(1e3 / STARTS_RATE_HZ)
-    sent: list[SentCommand] = []
-    off_m: list[float] = []
-    forward_m_s: list[float] = []
-    stays = round(STAYS_S * STARTS_RATE_HZ)
-    while plant.now_ms < 1e3 * (way_s + 2.0 * SPARE_S + STAYS_S):
-        left, right = plant.wheels_rad_s
-        state = PlannerState(plant.now_ns, *plant.pose, left, right, sent=tuple(sent[-50:]))
-        command = planner.plan(plant.now_ns, state).at(plant.now_ns)
-        sent.append(SentCommand(plant.now_ns, *command))
-        plant.advance(*command, period_ms)
-        off_m.append(abs(float(track.course.off_m(np.array([plant.pose[:2]]))[0])))
-        forward_m_s.append(plant.forward_m_s)
-        if len(off_m) >= stays and max(off_m[-stays:]) < ON_THE_LINE_M:
-            speed_m_s = float(np.mean(forward_m_s[-stays:]))
-            if abs(speed_m_s) > 0.5 * SPEED_M_S:
-                return plant.now_ms * 1e-3 - STAYS_S - way_s, speed_m_s < 0.0
-    return 2.0 * SPARE_S, False
+    }
 
 
 def main(arguments: list[str]) -> None:
     """Print figures as they are found."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
-    parser.add_argument("names", nargs="?", default=",".join(contenders()), help="contenders, or `starts COUNT [WAYS]`")
+    parser.add_argument("names", nargs="?", default=",".join(contenders()), help="contenders")
     parser.add_argument("ways", nargs="?", default=",".join(tracks(SPEED_M_S)))
     parser.add_argument("robots", nargs="?", default="", help="robots of each row, 6 unless said")
     parser.add_argument("--count", type=int, help="the same")
@@ -198,11 +139,6 @@ def main(arguments: list[str]) -> None:
     parser.add_argument("--slope", type=float, default=0.0, help="how fast the ground carries the robots (m/s)")
     parser.add_argument("--json", action="store_true", help="print one JSON object of all figures at the end")
     options = parser.parse_args(arguments)
-    if options.names == "starts":
-        for way in options.robots.split(",") if options.robots else STARTED_WAYS:
-            for key, value in starts(int(options.ways), (way,)).items():
-                print(f"{key:60} {value:10.3g}", flush=True)
-        return
     names, ways = options.names.split(","), options.ways.split(",")
     if options.slope and any(name.startswith(MUJOCO) for name in names):
         parser.error("--slope: the robot in MuJoCo stands on level ground")

@@ -1,11 +1,9 @@
 """`python -m tools.reference_tables`: writes the reference tables of the documentation from the code.
 
-    python -m tools.reference_tables            # writes docs/robot.md, docs/commands.md and docs/safety.md again
-    python -m tools.reference_tables --check    # only says which pages differ, with exit code 1
-
-A table stands between two comments that name it. Everything that the code knows is written anew: keys, allowed values,
-defaults, commands, states. Only the column `meaning` of robot.toml's keys is written by hand, in the page; it is kept
-for each key. A new key gets an empty meaning, which a test refuses.
+The pages are docs/robot.md, docs/commands.md and docs/safety.md. A table stands between two comments that name it.
+Everything that the code knows is written anew: keys, allowed values, defaults, commands, states. Only the column
+`meaning` of robot.toml's keys is written by hand, in the page; it is kept for each key. A new key gets an empty
+meaning, which a test refuses.
 """
 
 from __future__ import annotations
@@ -171,19 +169,13 @@ def written(page: str) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(
-        prog="python -m tools.reference_tables", description=(__doc__ or "").split("\n\n")[0]
-    )
-    parser.add_argument("--check", action="store_true", help="write nothing, and say which pages differ")
-    given = parser.parse_args()
-    different = [
-        page for page in (ROBOT, COMMANDS, SAFETY) if written(page.read_text("utf-8")) != page.read_text("utf-8")
-    ]
-    for page in different:
-        print(f"{page.relative_to(ROOT)}: {'differs from the code' if given.check else 'written'}")
-        if not given.check:
-            page.write_text(written(page.read_text("utf-8")), "utf-8")
-    return 1 if different and given.check else 0
+    argparse.ArgumentParser(prog="python -m tools.reference_tables", description=__doc__).parse_args()
+    for page in (ROBOT, COMMANDS, SAFETY):
+        present = page.read_text("utf-8")
+        if written(present) != present:
+            page.write_text(written(present), "utf-8")
+            print(f"{page.relative_to(ROOT)}: written")
+    return 0
 
 
 if __name__ == "__main__":

@@ -196,19 +196,3 @@ def running_stack(
             )
         )
         yield Stack(directory, robot_file, robot, daemon, Operator(directory / "control.sock", (robot, daemon)), stack)
-
-
-def first_truth_s(path: Path) -> float:
-    """Return when the truth begins, s of the monotonic clock."""
-    with path.open(encoding="utf-8") as file:
-        file.readline()
-        return int(file.readline().partition(",")[0]) * 1e-9
-
-
-def newest_truth_s(path: Path) -> float:
-    """Return when the newest row on disk was true."""
-    with path.open("rb") as file:
-        file.seek(0, 2)
-        file.seek(max(0, file.tell() - 1000))
-        rows = [row for row in file.read().split(b"\n")[1:-1] if row.count(b",") > 10]
-    return int(rows[-1].partition(b",")[0]) * 1e-9

@@ -1,7 +1,6 @@
 """Trials of the fence: random rooms with tasks, wild manual drives, and planners alone in tight rooms.
 
-Each drive is one line of `drives.jsonl`, so that a campaign that was broken off goes on where it was. The kinds of
-drives that `tools/fence_peers.py` adds (another controller, another simulation) stand in the same table.
+Each drive is one line of `drives.jsonl`, so that a campaign that was broken off goes on where it was.
 """
 
 from __future__ import annotations
@@ -37,7 +36,6 @@ from disco_hw.files import FileKind, read_bytes
 from disco_hw.model import Model
 from disco_hw.reports import write_pictures
 from disco_hw.runtime.assembly import create_planner
-from disco_hw.runtime.pipeline import Planner
 from disco_hw.runtime.robot_setup import Setup
 
 Array = NDArray[np.float64]
@@ -97,13 +95,12 @@ def alone_drive(
     off: float,
     seconds: float,
     contender: tuple[str, str, bool],
-    planner_of: Callable[[Setup], Planner] | None = None,
     setup_of: Callable[[np.random.Generator], Setup] = tight_setup,
     learning_s: float = LEARNING_S,
 ) -> FencedDrive:
     """Drive what `setup_of` returns by one of the CONTENDERS alone; the same rooms and robots for all.
 
-    Who adapts has `learning_s` to do so first. `planner_of` makes another planner for a setup.
+    Who adapts has `learning_s` to do so first.
     """
     setup = setup_of(rng)
     plant, noise = untold_plant(rng, off), int(rng.integers(1 << 30))
@@ -114,7 +111,7 @@ def alone_drive(
         robot = msgspec.structs.replace(setup.config.robot, axial_distance_m=0.415, x_icr_m=0.238, wheel_radius_m=0.061)
         config = msgspec.structs.replace(setup.config, robot=robot, prior=prior_around(robot))
         setup = replace(setup, config=config, model=Model.nominal(robot, config.prior))
-    planner = create_planner(setup.config, setup.model) if planner_of is None else planner_of(setup)
+    planner = create_planner(setup.config, setup.model)
     learning_s = learning_s if adaptation != "off" else 0.0
     return task_drive(setup, plant, planner, seconds + learning_s, noise, guarded=False, learning_s=learning_s)
 

@@ -131,7 +131,7 @@ def random_room(rng: np.random.Generator, pillars: int) -> Fence:
     return Fence(keep_in=corners, keep_out=tuple(posts))
 
 
-def random_task_room(rng: np.random.Generator, footprint: Footprint = FOOTPRINT) -> tuple[Fence, CircleTask]:
+def random_task_room(rng: np.random.Generator) -> tuple[Fence, CircleTask]:
     """Return a room, and a circle in it at which the footprint stays inside."""
     while True:
         radius_m = float(rng.uniform(0.4, 1.0))
@@ -141,7 +141,7 @@ def random_task_room(rng: np.random.Generator, footprint: Footprint = FOOTPRINT)
             speed_m_s=float(rng.uniform(0.15, 0.3)),
         )  # fmt: skip
         fence = random_room(rng, int(rng.integers(0, 3)))
-        if task_breach(fence, footprint, task.course()) is None:
+        if task_breach(fence, FOOTPRINT, task.course()) is None:
             return fence, task
 
 

@@ -1,11 +1,6 @@
 import time
 
-import pytest
-from hypothesis import strategies as st
-
 from disco_hw.daemon.loop import MonotonicClock, SuspendWatch
-from tests.daemon.simulated_clock import SimulatedClock
-from tests.tables import examples
 
 
 def test_monotonic_clock_never_returns_before_the_deadline():
@@ -27,25 +22,6 @@ def test_monotonic_clock_gives_the_cpu_away_while_it_waits():
     cpu_before_s = time.thread_time()
     clock.sleep_until_ns(clock.now_ns() + 100_000_000)
     assert time.thread_time() - cpu_before_s < 0.05
-
-
-@examples(quick=20, every=100, moves=st.lists(st.tuples(st.booleans(), st.integers(0, 10**12))))
-def test_simulated_clock_moves_only_when_asked_and_never_back(moves):
-    clock = SimulatedClock(7)
-    expected_ns = 7
-    for is_sleep, value_ns in moves:
-        if is_sleep:
-            clock.sleep_until_ns(value_ns)
-            expected_ns = max(expected_ns, value_ns)
-        else:
-            clock.advance_ns(value_ns)
-            expected_ns += value_ns
-        assert clock.now_ns() == expected_ns
-
-
-def test_simulated_clock_refuses_to_run_backwards():
-    with pytest.raises(ValueError, match="backwards"):
-        SimulatedClock().advance_ns(-1)
 
 
 def test_a_suspend_is_noticed_once_and_a_thread_that_is_held_up_between_two_clocks_is_none():

@@ -148,6 +148,10 @@ def test_random_values_are_bit_equal_in_python_c_and_cantools(case):
 )
 def test_whatever_the_wire_brings_the_answer_is_a_value(can_id, data):
     assert isinstance(CODEC.decode(can_id, data), Decoded | DecodeFault)
+    for layout in MESSAGES:
+        if layout.can_id == can_id and layout.data_id is not None:
+            protected = bytes((crc8(data[1:], layout.data_id),)) + data[1:]
+            assert isinstance(CODEC.decode(can_id, protected), Decoded | DecodeFault)
 
 
 def wheel_command(**changes):

@@ -7,13 +7,11 @@ import pytest
 from drivers.types import Frame
 from firmware_protocol.firmware_core import FirmwareConfig
 from sim.app import OptionError, VirtualRobotOptions, _check_faults
-from sim.can_protocol import ErrorState
 from sim.fault_player import COMMANDS, CpuHogs, FaultPlayer, Injection
 from sim.fault_schedule import KINDS, parse_schedule
 from sim.hub import Hub
 from sim.plant import Plant
 from sim.serial_line import SerialLine
-from sim.unixcan import UnixCanBus
 from sim.virtual_robot import TRUTH_COLUMNS, VirtualRobot
 from tests.drivers.waiting import wait_until
 from tools.faults.in_process import SimulatedCan
@@ -193,25 +191,6 @@ def test_kidnap(robot, injection):
     assert injection.execute("kidnap 0.5 -1 0.25", 0) == "ok"
     truth = robot.plant.truth
     assert (truth.x_m, truth.y_m, truth.yaw_rad) == pytest.approx((0.5, -1.0, 0.25))
-
-
-def test_bus_off_is_the_hosts_by_default_or_the_robots(link, injection):
-    with UnixCanBus(str(link.path)) as bus:
-        link.collect(0)
-        assert injection.execute("bus_off", 0) == "ok"
-        link.advance(0)
-        assert bus.recv(1).arbitration_id == 0x40
-    assert link.robot.node.state is ErrorState.ACTIVE
-    assert injection.execute("bus_off robot", 0) == "ok"
-    assert link.robot.node.state is ErrorState.BUS_OFF
-
-
-def test_unplug_lasts_as_long_as_asked(tmp_path, link, injection):
-    assert injection.execute("unplug 0.5", 1000 * MS) == "ok"
-    link.collect(1499 * MS)
-    assert not (tmp_path / "hub").exists()
-    link.collect(1500 * MS)
-    assert (tmp_path / "hub").exists()
 
 
 def test_babble_at_its_rate_until_asked_to_stop(link, injection):

@@ -1,4 +1,4 @@
-"""The table of who follows a line best: its robots, and what it calls a drive that begins anywhere."""
+"""The table of who follows a line best, and its robots."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from disco_hw.control.baselines import Kanayama
 from tools import bench_tracking
-from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots, turned_robot
+from tools.foreign_plant import ForeignPlant, robots, turned_robot
 from tools.mujoco_plant import BEHIND_M, mujoco_plant, mujoco_robots
 from tools.tracking import Drive, classical, drive, tracks
 
@@ -67,42 +67,6 @@ def test_a_robot_whose_back_is_its_front_is_the_same_machine():
         (-expected.wheels[0].right_angle_rad, -expected.wheels[0].left_speed_rad_s)
     )
     assert math.remainder(found.poses[0].yaw_rad - turned.pose[2], math.tau) == pytest.approx(0.0, abs=1e-9)
-
-
-class Straight:
-    """A planner that drives straight on."""
-
-    def __init__(self, wheels_rad_s: float) -> None:
-        self._wheels_rad_s = wheels_rad_s
-
-    def reset(self) -> None:
-        """Nothing is kept."""
-
-    def plan(self, _now_ns, _state):
-        """Itself, as its own plan."""
-        return self
-
-    def at(self, _now_ns):
-        """Return the same wheel speeds at all times."""
-        return self._wheels_rad_s, self._wheels_rad_s
-
-
-@pytest.mark.parametrize(
-    ("wheels_rad_s", "arrives", "backwards"), [(3.4, True, False), (-3.4, True, True), (0.0, False, False)]
-)
-def test_a_drive_arrives_that_stays_on_the_line_and_one_in_reverse_is_seen(
-    monkeypatch, wheels_rad_s, arrives, backwards
-):
-    class OnTheLine(ForeignPlant):
-        def __init__(self, robot, _start, seed):
-            super().__init__(robot, (0.4, 0.0, 0.0) if wheels_rad_s >= 0.0 else (1.3, 0.0, 0.0), seed)
-
-    monkeypatch.setattr(bench_tracking, "ForeignPlant", OnTheLine)
-    track = tracks()["square"]
-    robot = ForeignRobot(*NOMINAL, dead_rad_s=0.0, grip_std=0.0)
-    delay_s, went_back = bench_tracking._arrival_s(Straight(wheels_rad_s), robot, track, 1)
-    assert (delay_s < bench_tracking.SPARE_S) == arrives
-    assert went_back == backwards
 
 
 @pytest.mark.parametrize(("more", "first"), [((), bench_tracking.FIRST), (("--first", "5000"), 5000)])

@@ -7,15 +7,19 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
+import platform
+import re
 import signal
+import subprocess
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
-
-from tools.results import machine
 
 PARTS = (
     "bench_adapt",
@@ -26,7 +30,6 @@ PARTS = (
     "bench_inference",
     "bench_latency",
     "bench_log",
-    "bench_loop",
     "bench_start",
     "bench_tracking",
     "bench_viewer",
@@ -59,10 +62,22 @@ def main() -> int:
             "figures": figures,
         }
         Path("bench.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
-    console.print(
-        f"{len(figures)} figures in bench.json; python -m tools.results bench.json puts them into docs/results.md"
-    )
+    console.print(f"{len(figures)} figures in bench.json")
     return 0
+
+
+def machine() -> dict[str, Any]:
+    """Return the conditions of a measurement: the day (UTC), the state of the code, processor, cores, Python, load."""
+    describe = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--exclude=*", "--dirty=+"]
+    processor = re.search(r"^model name\s*: (.*)", Path("/proc/cpuinfo").read_text(encoding="utf-8"), re.MULTILINE)
+    return {
+        "date": datetime.now(UTC).strftime("%d %b %Y"),
+        "commit": subprocess.run(describe, capture_output=True, text=True, check=False).stdout.strip() or "unknown",
+        "cpu": processor[1] if processor else platform.processor(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "load": round(os.getloadavg()[0], 2),
+    }
 
 
 if __name__ == "__main__":

@@ -1,45 +1,59 @@
-"""Cost and gain of adaptation in the loop; `python -m tools.bench.adapt scenarios`: how well it estimates."""
+"""Cost of adaptation in the loop; `python -m tools.bench.adapt scenarios`: how well it estimates."""
 
 from __future__ import annotations
 
 import math
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.adaptation.fast import FastAdaptation
-from disco_hw.adaptation.guard import NAMES, Geometry, believed_geometry, with_geometry
+from disco_hw.adaptation.guard import Geometry, believed_geometry
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon.run import warm_up
-from disco_hw.experiments.adapt import BELIEVED_STD, CHANGES
-from disco_hw.log.reader import open_log
-from disco_hw.model import load_model, model_text
 from disco_hw.runtime.assembly import apply_geometry, create_fast_adaptation, create_pipeline, create_planner
-from disco_hw.runtime.robot_setup import Setup, load_setup
+from disco_hw.runtime.robot_setup import load_setup
 from drivers.types import PoseSample, Readings, WheelSample
 from tools.bench.step_times import percentiles, times_ms
 from tools.foreign_plant import NOMINAL, ForeignPlant, ForeignRobot, robots
-from tools.stack import CIRCLE_START, FAST_START, FAST_TASK, first_truth_s, newest_truth_s, running_stack
 
 Array = NDArray[np.float64]
 
-LIVE_S = 30.0
 LENGTHS = ("radius_m", "axle_m", "x_icr_m")
 # The order of the adaptation's arrays is x_icr, wheel radius, axial distance.
 _TO_ADAPTATION, _FROM_ADAPTATION = [2, 0, 1], [1, 2, 0]
 
 
 def run() -> dict[str, float]:
-    """Microseconds of the daemon's calls, and figures of the loop in real time."""
+    """Times of the calls that the loop makes, in microseconds."""
     setup = load_setup(SHIPPED_ROBOT)
-    return _calls(setup) | _live() | _changed_live()
+    planner = create_planner(setup.config, setup.model)
+    pipeline = create_pipeline(setup.config, setup.model, planner)
+    warm_up(pipeline)
+    adaptation = create_fast_adaptation(setup, pipeline)
+
+    def readings(k: int) -> Readings:
+        t_ns, angle_rad = k * 20_000_000, 0.08 * k
+        pose = PoseSample(t_ns, t_ns, 0.004 * k, 0.0, 0.0, 0.005, 0.01)
+        return Readings(
+            wheels=(WheelSample(t_ns, t_ns, angle_rad, angle_rad, 4.0, 4.0),), poses=(pose,) if k % 2 else ()
+        )
+
+    believed = believed_geometry(setup.model)
+    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(320)]
+    calls: dict[str, tuple[int, Callable[[int], object]]] = {
+        "feed": (2000, lambda k: adaptation.feed(k * 20_000_000, readings(k))),
+        "step": (2000, lambda k: adaptation.step(k * 20_000_000)),
+        "apply_geometry": (300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k])),
+    }
+    figures: dict[str, float] = {}
+    for name, (count, call) in calls.items():
+        figures |= percentiles(f"adapt.{name}_us", 1e3 * times_ms(call, count))
+    return figures
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,130 +200,6 @@ def _as_good(readings: Readings, scenario: Scenario, noise: np.random.Generator)
                 )
             )  # fmt: skip
     return Readings(wheels=readings.wheels, poses=tuple(found))
-
-
-def _calls(setup: Setup) -> dict[str, float]:
-    """Times of the calls that the loop makes."""
-    planner = create_planner(setup.config, setup.model)
-    pipeline = create_pipeline(setup.config, setup.model, planner)
-    warm_up(pipeline)
-    adaptation = create_fast_adaptation(setup, pipeline)
-
-    def readings(k: int) -> Readings:
-        t_ns, angle_rad = k * 20_000_000, 0.08 * k
-        pose = PoseSample(t_ns, t_ns, 0.004 * k, 0.0, 0.0, 0.005, 0.01)
-        return Readings(
-            wheels=(WheelSample(t_ns, t_ns, angle_rad, angle_rad, 4.0, 4.0),), poses=(pose,) if k % 2 else ()
-        )
-
-    believed = believed_geometry(setup.model)
-    beliefs = [Geometry(believed.mean * (1.0 + 1e-4 * k), believed.covariance) for k in range(320)]
-    calls: dict[str, tuple[int, Callable[[int], object]]] = {
-        "feed": (2000, lambda k: adaptation.feed(k * 20_000_000, readings(k))),
-        "step": (2000, lambda k: adaptation.step(k * 20_000_000)),
-        "apply_geometry": (300, lambda k: apply_geometry(pipeline, setup.model, beliefs[k])),
-    }
-    figures: dict[str, float] = {}
-    for name, (count, call) in calls.items():
-        figures |= percentiles(f"adapt.{name}_us", 1e3 * times_ms(call, count))
-    return figures
-
-
-def _live() -> dict[str, float]:
-    """The loop in real time with and without adaptation, while the network is trained and after."""
-    figures: dict[str, float] = {}
-    for name, arguments in (("without", ()), ("with", ("--adapt",))):
-        with TemporaryDirectory() as directory:
-            task = FAST_TASK.replace("0.45", "0.3")
-            with running_stack(Path(directory), task=task, start=FAST_START, run_arguments=arguments) as stack:
-                stack.start()
-                time.sleep(LIVE_S)
-                loop = stack.operator.status()["loop"]
-                stack.operator.request("quit")
-        for figure in ("p50", "p99", "p999", "max"):
-            figures[f"adapt.loop_{name}.lateness_{figure}_us"] = loop["lateness_us"][figure]
-            figures[f"adapt.loop_{name}.duration_{figure}_us"] = loop["duration_us"][figure]
-        figures[f"adapt.loop_{name}.overruns"] = float(loop["overruns"])
-        figures[f"adapt.loop_{name}.skipped"] = float(loop["skipped"])
-    return figures
-
-
-# Chosen for the live drive: the size of the change, when it comes, and what is left out and compared after it.
-GROWTH = 0.15
-LIVE_CHANGE_S = 75.0
-SETTLED_S = 20.0
-COMPARED_S = 20.0
-LIVE_TASK = 'kind = "circle"\nradius_m = 0.75\nspeed_m_s = 0.2\n'
-
-
-@dataclass(frozen=True, slots=True)
-class LiveDrive:
-    """Result of one drive in real time, with a change of the plant.
-
-    Mean tracking costs on the plant's truth, over 20 s before the change and from 20 s after it on; what changed, by
-    its size before, as the robot believed it at last, how long after the change (s) it was first reported, and what the
-    loop missed.
-    """
-
-    cost_before: float
-    cost_after: float
-    believed: float
-    published_s: float
-    overruns: int
-
-
-def drive_through_change(directory: Path, changes: str, *, adapt: bool) -> LiveDrive:
-    """Drive the paper's circle through a sudden change of the plant.
-
-    The belief is right, and as narrow as after `infer`, until the wheel radius or axial distance (`changes`) grows by
-    15 %.
-    """
-    model = load_model(SHIPPED_ROBOT.with_name("wombot_model.toml"))
-    mean = believed_geometry(model).mean
-    std = BELIEVED_STD * np.array([1.0, mean[1], mean[2]])
-    narrow = directory / "narrow.toml"
-    narrow.write_text(model_text(with_geometry(model, Geometry(mean, np.diag(std**2)))), encoding="utf-8")
-    axle, wheels = CHANGES[changes]
-    hidden = ("--hide", f"surface_change={axle * GROWTH},{LIVE_CHANGE_S},{wheels * GROWTH}")
-    # What a wrong geometry costs shows in sampled plans: refined ones make up for most of it beside the line.
-    control = f'mode = "sampled"\nadaptation = "{"auto" if adapt else "off"}"'
-    with running_stack(directory, "can", LIVE_TASK, CIRCLE_START, hidden, model=str(narrow), control=control) as stack:
-        stack.operator.wait_for("READY", 60.0)
-        stack.start()
-        stack.operator.wait_until("driving", lambda s: s["source"] == "plan", 10.0)
-        first_s = first_truth_s(directory / "truth.csv")
-        end_s = first_s + LIVE_CHANGE_S + SETTLED_S + COMPARED_S
-        status = stack.operator.wait_until("the end", lambda s: newest_truth_s(directory / "truth.csv") > end_s, 200.0)
-        stack.operator.request("quit")
-        assert stack.daemon.process.wait(10.0) == 0
-    table = np.genfromtxt(directory / "truth.csv", delimiter=",", skip_header=1, usecols=(0, 1, 2, 8))
-    t_s = table[:, 0] * 1e-9 - first_s - LIVE_CHANGE_S
-    cost = np.hypot(np.hypot(table[:, 1], table[:, 2]) - 0.75, table[:, 3] - 0.2)
-    with open_log(directory / "run.mcap") as log:
-        times_ns = log.columns("/belief")["t_ns"].tolist() if adapt else []
-        published = [t_ns * 1e-9 - first_s - LIVE_CHANGE_S for t_ns in times_ns]
-        published_s = min((at for at in published if at > 0.0), default=math.inf)
-    index = NAMES.index("wheel_radius_m" if wheels else "axial_distance_m")
-    believed = status["adaptation"]["mean"][NAMES[index]] / float(mean[index]) if adapt else 1.0
-    return LiveDrive(
-        float(cost[(t_s > -COMPARED_S) & (t_s < 0.0)].mean()),
-        float(cost[(t_s > SETTLED_S) & (t_s < SETTLED_S + COMPARED_S)].mean()),
-        believed,
-        published_s,
-        int(status["loop"]["overruns"]),
-    )
-
-
-def _changed_live() -> dict[str, float]:
-    """Wheels or axle that grow by 15 % under the real daemon: tracking costs before and after, adapting and not."""
-    figures: dict[str, float] = {}
-    for changes in ("wheel radius", "axial distance"):
-        for name, adapt in (("without", False), ("with", True)):
-            with TemporaryDirectory() as directory:
-                driven = drive_through_change(Path(directory), changes, adapt=adapt)
-            key = f"adapt.{changes.replace(' ', '_')}_live_{name}"
-            figures |= {f"{key}.{field}": float(value) for field, value in asdict(driven).items()}
-    return figures
 
 
 if __name__ == "__main__":

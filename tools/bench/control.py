@@ -1,4 +1,4 @@
-"""Benchmark of the planner: time of a step, beside pytorch_mppi too, and how it grows with the samples.
+"""Benchmark of the planner: time of a step, beside pytorch_mppi too.
 
 The paper's size throughout: K = 400 sequences, T = 50 steps, L = 7 sigma points; one thread.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +30,6 @@ PERIOD_NS = 20_000_000
 STEP_NS = 100_000_000
 PAPERS_SIZE = Sampler(samples=400, horizon=50)
 LARGEST_RAD_S = ROTATION
-SIZES = (400, 1600, 6400, 25_600)
 ROUNDS = 4
 # In a round our step and the bare loop take turns this often: who else is on the processor changes by the tenth second.
 BURSTS = 10
@@ -50,7 +48,6 @@ def run(steps: int = 3000, peer_steps: int = 100) -> dict[str, float]:
         figures |= on_the_robot(steps)
         figures |= compare_with_peer("skid_steer", *skid_steer_pair(model), steps, peer_steps)
         figures |= compare_with_peer("pendulum", *pendulum_pair(), steps, peer_steps)
-        figures |= scaling(model, max(steps // 100, 3))
     return figures
 
 
@@ -140,30 +137,4 @@ def compare_with_peer(name: str, ours: Step, theirs: Step, steps: int, peer_step
         **summary(f"control.{name}_pytorch_mppi_ms", peer),
         f"control.{name}_ratio_to_pytorch_mppi": float(np.median(peer) / np.median(mine)),
         f"control.{name}_ratio_of_minima": float(peer.min() / mine.min()),
-    }
-
-
-def scaling(model: Model, steps: int) -> dict[str, float]:
-    """Time of a step for each number of samples, over what is in proportion to 400 samples: 1 is linear."""
-    settings = DiscoSettings()
-    planners = {
-        size: Disco(
-            model,
-            CircleCost(),
-            replace(settings, sampler=replace(PAPERS_SIZE, samples=size)),
-            CommandLimits(LARGEST_RAD_S),
-        )
-        for size in SIZES
-    }
-    calls = [moving(number) for number in range(CALLS)]
-    least = dict.fromkeys(SIZES, math.inf)
-    for _ in range(ROUNDS):
-        for size, planner in planners.items():
-            count = max(2, steps * SIZES[0] // size)
-            step_ms = times_ms(lambda n, planner=planner: planner.plan(*calls[n % CALLS]), count, left_out=2)
-            least[size] = min(least[size], float(step_ms.min()))
-    shares = {size: least[size] / size for size in SIZES}
-    return {
-        **{f"control.scaling.k{size}_ms": least[size] for size in SIZES},
-        **{f"control.scaling.k{size}_over_linear": shares[size] / shares[SIZES[0]] for size in SIZES[1:]},
     }

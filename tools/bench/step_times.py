@@ -7,7 +7,6 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 
@@ -56,9 +55,3 @@ def summary(key: str, durations_ms: np.ndarray) -> dict[str, float]:
 def percentiles(key: str, durations: np.ndarray) -> dict[str, float]:
     """p50, p99 and p99.9 under `key`, in the unit of the durations."""
     return {f"{key}.p{at:g}": float(np.percentile(durations, at)) for at in (50.0, 99.0, 99.9)}
-
-
-def process_cpu_s(pid: int) -> float:
-    """CPU time that a process has taken, in user space and in the kernel."""
-    fields = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")

@@ -1,11 +1,10 @@
 """Measures on emulated processors what the firmware core costs, and prints the table of docs/port.md.
 
-    python -m tools.generate.firmware_figures [--check | --write]
+    python -m tools.generate.firmware_figures
 
 Code and constants: the linked core at -Os, without the C library's helpers. RAM: one core. Stack: the deepest, without
 interrupts. A step is a cycle of 1 ms with the sending of what it queued; a reception is one frame.
---check exits 1 if a figure has grown by a tenth or the worst step is more than three times the mean; --write puts the
-table into the document.
+`tests/firmware_protocol/ports/test_figures.py` has their limits.
 """
 
 import argparse
@@ -19,10 +18,7 @@ from pathlib import Path
 from firmware_protocol.build_firmware import SOURCES
 from tools.check.emulated_board import COMPILER, EMULATOR, FIRMWARE, FLAGS, PORTS, PROCESSORS, compile_for, missing
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "port.md"
 PROGRAM = Path(__file__).with_suffix(".c")
-GROWTH = 1.1
-WORST_TO_MEAN = 3.0
 # What a board calls of the core; the linker drops what none of these needs.
 ROOTS = (
     "disco_firmware_init", "disco_firmware_step", "disco_firmware_receive", "disco_firmware_pop", "disco_firmware_pose",
@@ -104,67 +100,19 @@ def measure(processor: str) -> dict[str, int]:
 
 
 def table(figures: Mapping[str, Mapping[str, int]]) -> str:
-    """Return the figures as the document has them."""
+    """Return the figures as a table in Markdown."""
     lines = [f"| | {' | '.join(figures)} |", f"|---|{'---:|' * len(figures)}"]
     lines += [f"| {label} | {' | '.join(str(of[name]) for of in figures.values())} |" for name, label in ROWS.items()]
     return "\n".join(lines) + "\n"
 
 
-def found(text: str) -> re.Match[str]:
-    """Return where the document has its table of figures: the processors' names, and the rows."""
-    block = re.search(r"^\| \|( m0plus .*)\|\n\|-.*\n((?:\|.*\n)+)", text, re.MULTILINE)
-    assert block is not None, f"{DOCUMENT}: no table of figures"
-    return block
-
-
-def documented(text: str) -> dict[str, dict[str, int]]:
-    """Return the figures that the document has, by processor."""
-    block = found(text)
-    processors = [name.strip() for name in block[1].split("|")]
-    names = {label: name for name, label in ROWS.items()}
-    figures: dict[str, dict[str, int]] = {processor: {} for processor in processors}
-    for line in block[2].splitlines():
-        label, *values = (cell.strip() for cell in line.strip("|").split("|"))
-        for processor, value in zip(processors, values, strict=True):
-            figures[processor][names[label]] = int(value)
-    return figures
-
-
-def complaints(new: Mapping[str, Mapping[str, int]], old: Mapping[str, Mapping[str, int]]) -> list[str]:
-    """Return what has grown by a tenth, and where the worst step is too far above the mean."""
-    grown = [
-        f"{processor}: {ROWS[name]}: {value}, and {old[processor][name]} in {DOCUMENT.name}: more than a tenth more"
-        for processor, figures in new.items()
-        for name, value in figures.items()
-        if value > GROWTH * old[processor][name]
-    ]
-    for processor, figures in new.items():
-        for key in ("", "key_"):
-            worst, mean = figures[f"{key}step_worst"], figures[f"{key}step_mean"]
-            if worst > WORST_TO_MEAN * mean:
-                grown.append(f"{processor}: the worst step, {key}{worst}, takes more than three times the mean, {mean}")
-    return grown
-
-
 def main() -> int:
-    """Measure, print, and check or write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    given = parser.add_mutually_exclusive_group()
-    given.add_argument("--check", action="store_true")
-    given.add_argument("--write", action="store_true")
-    arguments = parser.parse_args()
+    """Measure and print."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     if what := missing():
         print(what, file=sys.stderr)
-        # Where it may not be installed, a build goes on without it.
-        return 0 if arguments.check else 2
-    figures = {processor: measure(processor) for processor in PROCESSORS}
-    print(table(figures))
-    text = DOCUMENT.read_text("utf-8")
-    if arguments.write:
-        DOCUMENT.write_text(text.replace(found(text)[0], table(figures)), "utf-8")
-    elif arguments.check and (grown := complaints(figures, documented(text))):
-        print("\n".join(grown), file=sys.stderr)
-        return 1
+        return 2
+    print(table({processor: measure(processor) for processor in PROCESSORS}))
     return 0
 
 

@@ -1,45 +1,36 @@
-"""The check of what the firmware costs: a tenth more is seen, and a worst step too far above the mean."""
+"""What the firmware costs on each processor is within its limits, and the document has a row for each figure."""
+
+from pathlib import Path
 
 import pytest
 
 from tools.check.emulated_board import PROCESSORS, missing
 from tools.generate import firmware_figures
-from tools.generate.firmware_figures import DOCUMENT, ROWS, complaints, documented, measure, sizes, table
+from tools.generate.firmware_figures import ROWS, measure, sizes
 
-FIGURES = documented(DOCUMENT.read_text("utf-8"))
-
-
-def changed(processor, name, value):
-    return {other: figures | ({name: value} if other == processor else {}) for other, figures in FIGURES.items()}
-
-
-def test_the_document_has_every_figure_of_every_processor():
-    assert list(FIGURES) == ["m0plus", "m3", "m4f"]
-    assert all(list(figures) == list(ROWS) for figures in FIGURES.values())
-    assert table(FIGURES) in DOCUMENT.read_text("utf-8")
-
-
-def test_what_the_document_says_is_within_what_was_promised():
-    assert complaints(FIGURES, FIGURES) == []
-    assert FIGURES["m4f"]["step_worst"] <= 10_000
-    assert all(figures["ram"] <= 2 * 1024 for figures in FIGURES.values())
-    assert all(figures["code"] + figures["constants"] <= 13 * 1024 for figures in FIGURES.values())
-
-
-def test_a_figure_that_grew_by_more_than_a_tenth_is_told():
-    ram = FIGURES["m3"]["ram"]
-    assert complaints(changed("m3", "ram", ram * 11 // 10), FIGURES) == []
-    (complaint,) = complaints(changed("m3", "ram", ram * 11 // 10 + 1), FIGURES)
-    assert (
-        complaint == f"m3: RAM of the core, bytes: {ram * 11 // 10 + 1}, and {ram} in port.md: more than a tenth more"
-    )
+DOCUMENT = Path(__file__).parents[3] / "docs" / "port.md"
+# Chosen: a tenth above what was measured (docs/port.md), for m0plus, m3, m4f.
+LIMITS = {
+    "code": (13_442, 13_041, 13_149),
+    "constants": (884, 884, 884),
+    "code_link": (15_169, 14_766, 14_869),
+    "ram": (1883, 1883, 1883),
+    "stack": (585, 572, 501),
+    "step_mean": (8033, 4896, 2691),
+    "step_worst": (14_257, 7604, 5168),
+    "reception_mean": (2295, 1713, 1443),
+    "reception_worst": (2818, 2370, 2043),
+    "key_step_mean": (8046, 4904, 2700),
+    "key_step_worst": (15_109, 10_117, 7759),
+    "key_reception_mean": (8283, 6298, 6062),
+    "key_reception_worst": (15_601, 12_142, 11_816),
+}
 
 
-def test_a_step_that_takes_more_than_three_times_the_mean_is_told():
-    for key in ("", "key_"):
-        low = FIGURES["m4f"][f"{key}step_worst"] // 3 - 1
-        (complaint,) = complaints(changed("m4f", f"{key}step_mean", low), FIGURES)
-        assert "three times the mean" in complaint
+def test_the_document_has_every_figure():
+    rows = [line.split("|")[1].strip() for line in DOCUMENT.read_text("utf-8").splitlines() if line.startswith("|")]
+    assert [row for row in rows if row in ROWS.values()] == list(ROWS.values())
+    assert list(LIMITS) == list(ROWS)
 
 
 emulated = pytest.mark.skipif(bool(missing()), reason=missing() or "all there")
@@ -48,8 +39,14 @@ emulated = pytest.mark.skipif(bool(missing()), reason=missing() or "all there")
 @pytest.mark.long
 @emulated
 @pytest.mark.parametrize("processor", PROCESSORS)
-def test_what_is_measured_is_not_a_tenth_above_the_document(processor):
-    assert complaints({processor: measure(processor)}, FIGURES) == []
+def test_what_is_measured_is_within_its_limits(processor):
+    figures = measure(processor)
+    column = list(PROCESSORS).index(processor)
+    limits = {name: of[column] for name, of in LIMITS.items()}
+    assert {name: (value, limits[name]) for name, value in figures.items() if value > limits[name]} == {}
+    assert figures["code"] + figures["constants"] <= 13 * 1024
+    for key in ("", "key_"):
+        assert figures[f"{key}step_worst"] <= 3 * figures[f"{key}step_mean"]
 
 
 @pytest.mark.long
