@@ -33,7 +33,11 @@ def set_odrive(number, value):
         (VESC, set_vesc("timeout_ms", 0), "controller 51: its timeout is off"),
         (VESC, set_vesc("timeout_ms", 1000), "controller 51: its timeout is 1 s; set 0.1 s there"),
         (VESC, set_vesc("timeout_brake_current_a", 30.0), "brakes with 30 A"),
-        (ODRIVE, set_odrive(220, bytes(4)), "node 5: its watchdog is off"),
+        (
+            ODRIVE,
+            set_odrive(220, bytes(4)),
+            "node 5: its watchdog is off; set axis0.config.enable_watchdog and call odrv0.save_configuration()",
+        ),
         (ODRIVE, set_odrive(221, struct.pack("<f", 2.0)), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
         (
             ODRIVE,
