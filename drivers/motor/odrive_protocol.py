@@ -248,6 +248,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
 def safety_card(settings: OdriveSettings) -> SafetyCard:
     """Return the safety card of ODrives."""
+    watchdog = f"watchdog ({settings.watchdog_s:g} s), " if settings.watchdog_endpoints is None else ""
     return SafetyCard(
         host_silent=f"each axis, {settings.watchdog_s:g} s after the last frame, by its watchdog: the axis idles",
         stops_by="coasting: an ODrive in idle does not brake",
@@ -257,8 +258,8 @@ def safety_card(settings: OdriveSettings) -> SafetyCard:
         "heartbeat",
         wheel_fault="each axis idles at once, without torque: it coasts",
         unverified=(
-            f"watchdog ({settings.watchdog_s:g} s), velocity limit and heartbeat period are declared in robot.toml "
-            "and were not read back; any frame to an axis may feed its watchdog",
+            f"{watchdog}velocity limit and heartbeat period are declared in robot.toml and were not read back; any "
+            "frame to an axis may feed its watchdog",
             "not tested on hardware: the driver was tested against a simulator made from the vendor's source",
         ),
         setup=(

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from disco_hw.runtime.preflight import Level, check_watchdog
+from drivers.motor import find_driver
 from drivers.motor.vesc_codec import timeout
 from drivers.types import DriverState
 from tests.drivers.motor.bench import IDLE_STATES
@@ -54,6 +55,13 @@ def test_a_controller_whose_watchdog_is_another_or_not_where_it_should_be_is_ref
     assert expected_detail in bench.driver.detail
     assert bench.driver.identity is bench.driver.limits is None
     assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
+
+
+def test_the_safety_card_says_that_the_watchdog_was_not_read_back_only_where_it_is_not():
+    declared, read_back = (find_driver("odrive").safety_card(one.settings) for one in (BY_LABEL["odrive-0.6"], ODRIVE))
+    assert "watchdog (0.1 s), velocity limit and heartbeat" in " ".join(declared.unverified)
+    assert "watchdog (" not in " ".join(read_back.unverified)
+    assert "velocity limit and heartbeat period are declared" in " ".join(read_back.unverified)
 
 
 def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():
