@@ -180,6 +180,7 @@ DRIVER = MotorDriver(
     lambda settings, _key: VendorDriver(_AgilexPort(settings)),
     settings=AgilexSettings,
     takes_body_speeds=True,
+    largest_difference_rad_s=lambda settings: settings.largest_difference_rad_s,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
     latches_stop=False,

@@ -26,7 +26,13 @@ _PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 2
 
 @dataclass(slots=True)
 class AgilexBase:
-    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s)."""
+    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
+
+    It holds either to its own limit, whatever becomes of the curve: `max_speed_m_s` and `max_turn_rad_s`.
+    """
+
+    max_speed_m_s: float = math.inf
+    max_turn_rad_s: float = math.inf
 
     vehicle_state: int = 0
     control_mode: int = STANDBY
@@ -67,7 +73,11 @@ class AgilexBase:
             return 0.0, 0.0
         if self._now_ms - self.last_motion_ms > TIMEOUT_MS:
             return 0.0, 0.0
-        return 1e-3 * self.commanded_motion[0], 1e-3 * self.commanded_motion[1]
+        linear, angular = (1e-3 * value for value in self.commanded_motion)
+        return (
+            min(max(linear, -self.max_speed_m_s), self.max_speed_m_s),
+            min(max(angular, -self.max_turn_rad_s), self.max_turn_rad_s),
+        )
 
     def receive(self, frame: CanFrame) -> list[CanFrame]:
         """Take in one frame; return the replies."""
@@ -162,7 +172,7 @@ class AgilexController:
         self._settings = settings
         self._ticks_per_rev = ticks_per_rev
         self._ticks = self._zero_ticks = (0, 0)
-        self.base = AgilexBase()
+        self.base = self._create_base()
 
     @property
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
@@ -216,7 +226,10 @@ class AgilexController:
     def restart(self) -> None:
         """Switch off and on: standby, nothing counted."""
         self._zero_ticks = self._ticks
-        self.base = AgilexBase()
+        self.base = self._create_base()
+
+    def _create_base(self) -> AgilexBase:
+        return AgilexBase(max_speed_m_s=self._settings.max_speed_m_s, max_turn_rad_s=self._settings.max_turn_rad_s)
 
 
 CONTROLLER = AgilexController

@@ -158,7 +158,8 @@ def test_an_agilexs_state_and_odometry_are_read():
     ],
 )
 def test_an_agilexs_messages_without_a_use_are_known_all_the_same(frame, expected):
-    driver = create_driver("agilex", agilex.AgilexSettings(wheel_radius_m=0.06, track_m=0.31, max_speed_m_s=1.5))
+    measures = {"wheel_radius_m": 0.06, "track_m": 0.31, "max_speed_m_s": 1.5, "max_turn_rad_s": 2.5}
+    driver = create_driver("agilex", agilex.AgilexSettings(**measures))
     driver.link_up(0)
     driver.receive(0, [ReceivedFrame(0, frame)])
     assert getattr(driver.stats, expected) == 1
