@@ -243,7 +243,7 @@ QUESTIONS = LineQuestions(
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     """Return the motors of the boards that reported their version.
 
-    One board has both sides, of several the first half is left.
+    One board has both sides, of several the first half is left. A board on USB answers to every address.
     """
     version = GETTERS["version"].command
     queries = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
@@ -254,6 +254,8 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
             if FIRST_ADDRESS <= address <= LAST_ADDRESS and reply(address, "version", frame.data) is not None
         }
     )
+    if len(boards) == len(QUESTIONS.frames):
+        del boards[1:]
     motors = [f"{address}/{motor}" for address in boards for motor in (1, 2)]
     return {"motors": in_sides(motors)} if motors else None
 

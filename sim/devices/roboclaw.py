@@ -53,14 +53,15 @@ class RoboclawRegisters:
 
 
 class Roboclaw:
-    """One board at `address`.
+    """One board at `address`; on USB it takes each packet for its own, whatever address of 0x80 to 0x87 that has.
 
     `command` is what the motors are to do: "speed" in counts/s (with `accel` in counts/s^2, None for as fast as it
     can), "duty" in 1/32767, or None when nobody has said or the timeout has stopped them.
     """
 
-    def __init__(self, address: int = 0x80) -> None:
+    def __init__(self, address: int = 0x80, *, is_on_usb: bool = False) -> None:
         self.address = address
+        self.is_on_usb = is_on_usb
         self.registers = RoboclawRegisters()
         self.command: tuple[str, float, float] | None = None
         self.accel: float | None = None
@@ -90,7 +91,7 @@ class Roboclaw:
                     # What follows cannot be distinguished from it.
                     self._pending.clear()
                     break
-                if address == self.address:
+                if self._is_meant(address):
                     arguments = struct.unpack(">" + body, packet[2:-2])
                     self._feed(now_us)
                     self.obeyed.append((command, arguments))
@@ -98,7 +99,7 @@ class Roboclaw:
                     out += b"\xff"
             elif command in _GETTERS:
                 del self._pending[:2]
-                if address == self.address:
+                if self._is_meant(address):
                     self._feed(now_us)
                     data = _GETTERS[command](self.registers)
                     out += data + binascii.crc_hqx(bytes((address, command)) + data, 0).to_bytes(2)
@@ -111,6 +112,9 @@ class Roboclaw:
         timeout_us = self.registers.timeout_ds * 100_000
         if timeout_us and now_us - self._fed_us > timeout_us:
             self.command = None
+
+    def _is_meant(self, address: int) -> bool:
+        return 0x80 <= address <= 0x87 if self.is_on_usb else address == self.address
 
     def _feed(self, now_us: int) -> None:
         self.fed += 1

@@ -4,8 +4,10 @@ import pytest
 
 from disco_hw.config import Control, Link
 from disco_hw.runtime.preflight import Level, check_link_load
+from drivers.motor import find_driver
 from drivers.motor.roboclaw_protocol import SETTERS
 from drivers.types import DriverState, Request, WheelCommand
+from sim.devices.roboclaw import Roboclaw
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
 from tests.drivers.motor.vendors import BY_LABEL
 
@@ -109,6 +111,24 @@ def test_an_e_stop_that_the_board_latches_by_itself_is_reset_only_when_asked_to(
     assert bench.driver.state is DriverState.ESTOP
     assert not [frame for frame in bench.robot.received if frame.can_id & 0xFF == 200]
     bench.request(Request.RESET).run_until(*IDLE_STATES)
+
+
+@pytest.mark.parametrize(
+    ("line", "motors"),
+    [
+        ([Roboclaw(0x83, is_on_usb=True)], ["128/1", "128/2"]),
+        ([Roboclaw(0x83)], ["131/1", "131/2"]),
+        ([Roboclaw(0x80), Roboclaw(0x81)], [["128/1", "128/2"], ["129/1", "129/2"]]),
+    ],
+    ids=["one on USB", "one", "two"],
+)
+def test_a_board_on_usb_which_answers_to_every_address_is_one_board(line, motors):
+    driver = find_driver("roboclaw")
+    exchange, found = driver.exchange(ONE.settings), []
+    for number, question in enumerate(driver.questions.frames):
+        received = b"".join(board.receive(number * 100_000, exchange.request(question)) for board in line)
+        found.append(exchange.reply(question, received))
+    assert driver.recognise([reply for reply in found if reply is not None]) == {"motors": motors}
 
 
 def test_the_two_byte_status_of_older_firmware_is_taken(bench):
