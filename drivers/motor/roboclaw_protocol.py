@@ -103,7 +103,8 @@ def with_crc(packet: bytes) -> bytes:
 def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value], int] | None:
     """Return the fields of the reply that `received` begins with and how many bytes it has; None if it is none yet.
 
-    The status word has two bytes on older firmware and four on newer; a version text ends with a line feed and a zero.
+    The status word, of two bytes on older firmware, is returned as the four of newer; a version text ends with a line
+    feed and a zero.
     """
     layout = GETTERS[name]
     head = _head(address, layout.command)
@@ -117,13 +118,21 @@ def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value]
         return MappingProxyType(layout.unpack(received)), layout.length + _CRC_BYTES
     older = name == "status" and len(received) == _OLDER_STATUS.size + _CRC_BYTES
     if older and _checks(head, received, _OLDER_STATUS.size):
-        return MappingProxyType({"status_u32": _OLDER_STATUS.unpack_from(received)[0]}), len(received)
+        return MappingProxyType({"status_u32": _in_32_bits(*_OLDER_STATUS.unpack_from(received))}), len(received)
     return None
 
 
 def getter_name(command: int) -> str | None:
     """Name of the command that asks with this number."""
     return _GETTER_BY_NUMBER[command].name if command in _GETTER_BY_NUMBER else None
+
+
+def _in_32_bits(older: int) -> int:
+    """Return an older status of 16 bits as a newer one of 32.
+
+    Lowest are two warnings of current, then the errors, then the other warnings and the home switches.
+    """
+    return (older & 0x3) << 16 | (older & 0x3FC) >> 2 | (older & 0xFC00) << 8
 
 
 def _head(address: int, command: int) -> bytes:

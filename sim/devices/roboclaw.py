@@ -167,6 +167,18 @@ def _counts(*values: int) -> bytes:
     return b"".join((value & 0xFFFF_FFFF).to_bytes(4) for value in values)
 
 
+_SHORT_STATUS = (
+    0x10000, 0x20000, 0x1, 0x2, 0x4, 0x8, 0x10, 0x20, 0x40, 0x80, 0x40000, 0x80000, 0x100000, 0x200000, 0x400000,
+    0x800000,
+)  # fmt: skip
+"""Status of boards with 16 bits, from the lowest on: which bit of the 32 means the same (manuals, command 90)."""
+
+
+def _short_status(status: int) -> int:
+    """Return the status as an older board sends it; what that does not know is left out."""
+    return sum(1 << number for number, bit in enumerate(_SHORT_STATUS) if status & bit)
+
+
 _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
     15: lambda r: bytes([r.timeout_ds]),
     16: lambda r: _counts(r.encoder_m1) + bytes([r.encoder_m1_status]),
@@ -186,7 +198,7 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
     79: lambda r: _counts(r.speed_m1, r.speed_m2),
     82: lambda r: r.temperature_1.to_bytes(2),
     83: lambda r: r.temperature_2.to_bytes(2),
-    90: lambda r: (r.status & 0xFFFF).to_bytes(2) if r.short_status else r.status.to_bytes(4),
+    90: lambda r: _short_status(r.status).to_bytes(2) if r.short_status else r.status.to_bytes(4),
     202: lambda r: bytes([r.estop_lock]),
 }
 

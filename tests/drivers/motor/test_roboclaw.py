@@ -5,6 +5,8 @@ import pytest
 from disco_hw.config import Control, Link
 from disco_hw.runtime.preflight import Level, check_link_load
 from drivers.motor import find_driver
+from drivers.motor import roboclaw_protocol as protocol
+from drivers.motor.roboclaw import Board
 from drivers.motor.roboclaw_protocol import SETTERS
 from drivers.types import DriverState, Request, WheelCommand
 from sim.devices.roboclaw import Roboclaw
@@ -131,13 +133,33 @@ def test_a_board_on_usb_which_answers_to_every_address_is_one_board(line, motors
     assert driver.recognise([reply for reply in found if reply is not None]) == {"motors": motors}
 
 
-def test_the_two_byte_status_of_older_firmware_is_taken(bench):
+# The vendor's manual of the USB RoboClaw 2x120A HV, command 90; warnings and home switches stop nothing.
+OLDER_STATUS = {
+    0x0001: "", 0x0002: "", 0x0004: "e-stop input", 0x0008: "too hot", 0x0010: "too hot",
+    0x0020: "main supply's voltage is too high", 0x0040: "logic supply's voltage is too high",
+    0x0080: "logic supply's voltage is too low", 0x0100: "power stage of motor 1", 0x0200: "power stage of motor 2",
+    0x0400: "", 0x0800: "", 0x1000: "", 0x2000: "", 0x4000: "", 0x8000: "",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("bit", "expected"), OLDER_STATUS.items(), ids=map(hex, OLDER_STATUS))
+def test_the_two_byte_status_of_older_firmware_has_a_layout_of_its_own(bit, expected):
+    read, length = protocol.reply(0x80, "status", protocol.with_crc(b"\x80\x5a" + bit.to_bytes(2))[2:])
+    board = Board(0x80, {"status": read})
+    assert length == 4
+    assert expected in board.error_text if expected else not board.errors
+
+
+def test_a_board_with_the_two_byte_status_is_driven_and_its_e_stop_input_stops_it(bench):
     for board in boards(bench):
         board.registers.short_status = True
     drive(bench)
-    boards(bench)[0].registers.status = 0x4000
+    boards(bench)[0].registers.status = 0x10000
     bench.run(0.3)
-    assert "voltage is too low" in bench.driver.detail
+    assert bench.driver.state is DriverState.ARMED, "a warning"
+    bench.robot.press_estop(True)
+    bench.run(0.3)
+    assert bench.driver.state is DriverState.ESTOP
 
 
 def test_a_speed_beyond_what_the_board_can_do_is_held_to_it(bench):

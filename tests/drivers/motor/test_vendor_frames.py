@@ -246,6 +246,6 @@ def test_a_roboclaws_value_is_held_to_what_the_wire_can_say():
 
 def test_a_roboclaws_answer_is_read_with_its_sign_and_its_status_may_have_two_bytes():
     assert roboclaw.reply(0x80, "encoders", ENCODERS) == ({"encoder_m1": 1, "encoder_m2": -1}, 10)
-    for status, length in ((b"\x40\x01", 4), (b"\0\0\x40\x01", 6)):
+    for status, length, meant in ((b"\x01\x05", 4, 0x10041), (b"\0\0\x40\x01", 6, 0x4001)):
         received = roboclaw.with_crc(b"\x80\x5a" + status)[2:]
-        assert roboclaw.reply(0x80, "status", received) == ({"status_u32": 0x4001}, length)
+        assert roboclaw.reply(0x80, "status", received) == ({"status_u32": meant}, length)
