@@ -65,6 +65,13 @@ _ERROR_TEXTS = {
 TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
 
 
+DUTY_ACCELS = "default_duty_accels"
+"""Asked for before arming; not every board knows the question."""
+# Chosen: so many answers in a row are not lost.
+_DUTY_ACCELS_TRIES = 5
+# Full duty, and Chosen: the shortest serial timeout; an e-stop, zero duty, may take no longer than a silent host.
+_FULL_DUTY, _LONGEST_RAMP_S = 32767.0, 0.1
+
 # Chosen: above the noise of a counted speed, and below any motion that could matter.
 _STATIONARY_RAD_S = 0.1
 # As many as the reference controller asks for (firmware/command.c).
@@ -89,7 +96,8 @@ class Board:
     """State of one board: newest reply to each question in `known`, and the odometers of both motors in `turned`.
 
     `stopped`: it has taken a stop since the last command. `timeout_ds`: its serial timeout in steps of 0.1 s, as read
-    since arming began. `waits_ns`: since when it has not answered, `refuses_ns` since when it has taken no command.
+    since arming began. `requested_accels`: how often it was asked for them. `waits_ns`: since when it has not answered,
+    `refuses_ns` since when it has taken no command.
     """
 
     address: int
@@ -98,6 +106,7 @@ class Board:
     stopped: bool = False
     zeros: int = 0
     timeout_ds: int | None = None
+    requested_accels: int = 0
     waits_ns: int | None = None
     refuses_ns: int | None = None
 
@@ -120,7 +129,25 @@ class Board:
     @property
     def is_known(self) -> bool:
         """Whether every reply needed before arming has been read from the board."""
-        return all(name in self.known for name in TO_KNOW)
+        return not self.unknown
+
+    @property
+    def unknown(self) -> list[str]:
+        """Names of the replies that have not been read yet; of the accelerations it may know nothing."""
+        names = TO_KNOW if self.requested_accels >= _DUTY_ACCELS_TRIES else (*TO_KNOW, DUTY_ACCELS)
+        return [name for name in names if name not in self.known]
+
+    @property
+    def slow_stop(self) -> str | None:
+        """Text on why zero duty would stop its motors too slowly, and what to set; None if it would not."""
+        decels = self.known.get(DUTY_ACCELS, {}).values()
+        ramp_s = max((_FULL_DUTY / max(float(decel), 1.0) for decel in decels), default=0.0)
+        if ramp_s <= _LONGEST_RAMP_S:
+            return None
+        return (
+            f"board {self.address}: its e-stop takes {ramp_s:.3g} s from full duty; set Default Accel to 655359 "
+            "(Motion Studio), for both motors"
+        )
 
     @property
     def is_pressed(self) -> bool:
@@ -146,7 +173,7 @@ class Board:
 
     def reset_state(self) -> None:
         """Clear the board's replies, as for a new connection; the angles that its motors have turned are kept."""
-        self.known, self.waits_ns, self.timeout_ds = {}, None, None
+        self.known, self.waits_ns, self.timeout_ds, self.requested_accels = {}, None, None, 0
         for motor in self.turned:
             motor.reset_state()
 
@@ -176,6 +203,7 @@ class _RoboclawPort(Port):
         pressed = any(board.is_pressed for board in self._all)
         return Controllers(
             missing=missing if silent else None,
+            refused=next(filter(None, (board.slow_stop for board in self._all)), None),
             stopped="its e-stop input is pressed" if pressed else None,
             faulty="; ".join(board.error_text for board in self._all if board.errors) or None,
         )
@@ -183,7 +211,7 @@ class _RoboclawPort(Port):
     @property
     def identity(self) -> Identity | None:
         """Identity that the first board reports; None before all boards are known."""
-        if not self._is_known:
+        if not self._is_known or self.seen.refused is not None:
             return None
         return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
 
@@ -332,8 +360,9 @@ class _RoboclawPort(Port):
         turn, number = divmod(self._slow, len(self._all))
         for board in boards:
             board.waits_ns = now_ns if board.waits_ns is None else board.waits_ns
-            unknown = [name for name in TO_KNOW if name not in board.known]
+            unknown = board.unknown
             names = unknown[:1] or ["speeds", "encoders"]
+            board.requested_accels += DUTY_ACCELS in names
             if not unknown and board is self._all[number]:
                 names.append("serial_timeout" if turn % _TIMEOUT_EVERY == 0 else "status")
             frames += [query(board.address, name) for name in names]

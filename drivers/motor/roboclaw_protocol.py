@@ -66,6 +66,7 @@ GETTERS = layouts(
     ("velocity_pid_m2", 56, "IIII", "p i d qpps"),
     ("encoders", 78, "ii", "encoder_m1 encoder_m2"),
     ("speeds", 79, "ii", "speed_m1 speed_m2"),
+    ("default_duty_accels", 81, "II", "decel_m1 decel_m2"),
     ("temperature_1", 82, "H", "temperature_decidegree"),
     ("temperature_2", 83, "H", "temperature_decidegree"),
     ("status", 90, "I", "status_u32"),
@@ -74,6 +75,8 @@ GETTERS = layouts(
 GAIN_STEPS = 65536
 """Of a velocity gain in one unit; the order of the gains differs between setting and asking."""
 _OLDER_STATUS = struct.Struct(">H")
+# Of each motor the acceleration, then the deceleration, by the vendor's newer library.
+_NEWER_DUTY_ACCELS = struct.Struct(">4xI4xI")
 _GETTER_BY_NUMBER = by_number(GETTERS)
 Value = float | int | str
 
@@ -116,6 +119,10 @@ def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value]
         return MappingProxyType({"version": text}), end + 2 + _CRC_BYTES
     if _checks(head, received, layout.length):
         return MappingProxyType(layout.unpack(received)), layout.length + _CRC_BYTES
+    newer = name == "default_duty_accels"
+    if newer and _checks(head, received, _NEWER_DUTY_ACCELS.size):
+        decels = _NEWER_DUTY_ACCELS.unpack_from(received)
+        return MappingProxyType(dict(zip(layout.fields, decels, strict=True))), _NEWER_DUTY_ACCELS.size + _CRC_BYTES
     older = name == "status" and len(received) == _OLDER_STATUS.size + _CRC_BYTES
     if older and _checks(head, received, _OLDER_STATUS.size):
         return MappingProxyType({"status_u32": _in_32_bits(*_OLDER_STATUS.unpack_from(received))}), len(received)
@@ -307,7 +314,7 @@ def safety_card(settings: RoboclawSettings) -> SafetyCard:
         ),
         setup=(
             "Motion Studio: packet serial at link.baud, each board its own address, encoders and velocity PID tuned "
-            "(QPPS is taken as the fastest speed)",
+            "(QPPS is taken as the fastest speed); Default Accel 655359, with which zero duty is ramped",
         ),
     )
 

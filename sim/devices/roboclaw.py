@@ -45,11 +45,14 @@ class RoboclawRegisters:
     temperature_2: int = 300
     status: int = 0
     estop_lock: int = 0x55
+    duty_accel_m1: int = 655_360
+    duty_accel_m2: int = 655_360
     pid_m1: tuple[int, int, int, int] = (65536, 32768, 0, 100_000)
     pid_m2: tuple[int, int, int, int] = (65536, 32768, 0, 100_000)
     version: str = "USB Roboclaw 2x30a v4.3.6\n"
     nvm_writes: int = 0
     short_status: bool = False
+    has_duty_decel: bool = False
 
 
 class Roboclaw:
@@ -148,6 +151,8 @@ class Roboclaw:
                 self._drive("speed", a[0], a[1])
             case 40:
                 self._drive("speed", a[1], a[2], a[0])
+            case 68 | 69:
+                setattr(registers, f"duty_accel_m{command - 67}", a[0])
             case 94:
                 registers.nvm_writes += a[0] == 0xE22EAB7A
             case 200 if registers.estop_lock == 0xAA:
@@ -158,7 +163,7 @@ class Roboclaw:
 
 _SETTERS = {
     14: "B", 20: "", 28: "IIII", 29: "IIII", 34: "hh", 35: "i", 36: "i", 37: "ii", 40: "Iii",
-    94: "I", 200: "", 201: "B",
+    68: "I", 69: "I", 94: "I", 200: "", 201: "B",
 }  # fmt: skip
 """By command: how its arguments are packed. Those of a velocity PID are D, P, I, QPPS."""
 
@@ -196,6 +201,9 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
     56: lambda r: _counts(*r.pid_m2),
     78: lambda r: _counts(r.encoder_m1, r.encoder_m2),
     79: lambda r: _counts(r.speed_m1, r.speed_m2),
+    81: lambda r: b"".join(
+        _counts(*(2 if r.has_duty_decel else 1) * (accel,)) for accel in (r.duty_accel_m1, r.duty_accel_m2)
+    ),
     82: lambda r: r.temperature_1.to_bytes(2),
     83: lambda r: r.temperature_2.to_bytes(2),
     90: lambda r: _short_status(r.status).to_bytes(2) if r.short_status else r.status.to_bytes(4),
@@ -206,7 +214,8 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
 class RoboclawController:
     """All boards of a robot on one serial line: satisfies `virtual_robot.Controller`; frames carry the line's bytes.
 
-    Motors whose command has ended, by the serial timeout or an error, coast; zero duty brakes. `dead`: addresses of
+    Motors whose command has ended, by the serial timeout or an error, coast; zero duty brakes, after the ramp of the
+    default duty acceleration. `dead`: addresses of
     boards without supply.
     """
 
@@ -301,8 +310,11 @@ class RoboclawController:
         kind, *values = board.command
         target = values[motor]
         if kind == "duty":
-            qpps = (board.registers.pid_m1, board.registers.pid_m2)[motor][3]
-            self._ramped[place] = target / 32767.0 * qpps
+            # By the default duty acceleration, in 1/32767 of full duty a second; a released motor has no duty.
+            accel = (board.registers.duty_accel_m1, board.registers.duty_accel_m2)[motor]
+            per_duty = (board.registers.pid_m1, board.registers.pid_m2)[motor][3] / 32767.0
+            now, step = self._ramped.get(place, 0.0), 1e-3 * accel * per_duty
+            self._ramped[place] = now + min(max(target * per_duty - now, -step), step)
             return
         now = self._ramped.get(place, measured_counts_s)
         step = math.inf if board.accel is None else 1e-3 * board.accel

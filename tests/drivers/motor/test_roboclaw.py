@@ -89,6 +89,39 @@ def test_a_board_that_takes_no_commands_is_lost_though_it_answers(bench):
     assert bench.robot.controller.wheels_rad_s == (0.0, 0.0)
 
 
+@pytest.mark.parametrize("has_duty_decel", [False, True])
+def test_a_board_that_ramps_zero_duty_slowly_is_refused_with_what_to_set(bench, has_duty_decel):
+    """An e-stop would take seconds: command 34 is ramped by the default duty acceleration."""
+    for board in boards(bench):
+        board.registers.has_duty_decel = has_duty_decel
+    boards(bench)[-1].registers.duty_accel_m2 = 8192
+    bench.request(Request.ARM).run(1.0, FORWARD)
+    assert bench.driver.state is DriverState.REFUSED
+    assert f"board {boards(bench)[-1].address}: its e-stop takes 4 s from full duty" in bench.driver.detail
+    assert "set Default Accel to 655359 (Motion Studio)" in bench.driver.detail
+    assert bench.largest_speed == 0.0
+
+
+@pytest.mark.parametrize("has_duty_decel", [False, True])
+def test_an_e_stop_of_a_board_that_is_not_refused_is_over_in_a_tenth_of_a_second(bench, has_duty_decel):
+    for board in boards(bench):
+        board.registers.has_duty_decel = has_duty_decel
+        board.registers.duty_accel_m1 = board.registers.duty_accel_m2 = 327_680
+        board.registers.pid_m1 = board.registers.pid_m2 = (65536, 32768, 0, 20_000)
+    bench.drive(1.0, (15.0, 15.0))
+    assert bench.robot.speed == pytest.approx((15.0, 15.0), abs=0.1)
+    bench.send_estop()
+    bench.run(0.11)
+    assert bench.robot.speed_rad_s == 0.0
+
+
+def test_a_board_that_does_not_know_the_question_for_its_duty_ramp_is_driven():
+    bench = ONE.bench()
+    receive = bench.robot.receive
+    bench.robot.receive = lambda now_ns, frame: None if frame.can_id & 0xFF == 81 else receive(now_ns, frame)
+    drive(bench)
+
+
 def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
     drive(bench)
     bench.robot.press_estop(True)
