@@ -291,7 +291,7 @@ class MotorDriver:
     name: str
     make: Callable[[Any, bytes | None], Driver]
     stop_frames: Callable[[Any], tuple[Frame, ...]]
-    stop_confirmation: Callable[[Any], Callable[[Frame], bool]]
+    stop_confirmation: Callable[[Any], Callable[[ReceivedFrame], bool]]
     cyclic_frames: Callable[[Any, float, bool], tuple[CyclicFrame, ...]]
     safety_card: Callable[[Any], SafetyCard]
     slowest_rad_s: Callable[[Any], float] = lambda _settings: 0.0

@@ -280,13 +280,13 @@ def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:
     """Zero duty for every board, and the question whether its motors stand; nothing latches it."""
     return (
         *(setting(address, "duty_m1m2", duty_m1=0, duty_m2=0) for address in settings.addresses),
-        *(query(address, "speeds") for address in settings.addresses),
+        *(query(address, "encoders") for address in settings.addresses),
     )
 
 
 def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """Return the frames of each period: a command, speeds and counts of each board, and one question more."""
-    each = {"speed command": 16 + 1, "speeds": 2 + 10, "encoders": 2 + 10}
+    """Return the frames of each period: a command and the counts of each board, and one question more."""
+    each = {"speed command": 16 + 1, "encoders": 2 + 10}
     frames = [
         CyclicFrame(f"{name} of {address}", "LINE", length, command_rate_hz, length, _TURNAROUND_S)
         for address in settings.addresses

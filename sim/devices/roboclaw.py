@@ -10,6 +10,7 @@ from __future__ import annotations
 import binascii
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -228,6 +229,7 @@ class RoboclawController:
         self._ticks = self._zero_ticks = (0, 0)
         self._measured = (0.0, 0.0)
         self._ramped: dict[tuple[int, int], float] = {}
+        self._counted: tuple[deque[int], deque[int]] = (deque(maxlen=4), deque(maxlen=4))
 
     @property
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
@@ -282,10 +284,12 @@ class RoboclawController:
             ticks = self._ticks[number] - self._zero_ticks[number]
             count = round(direction * ticks * self._counts_per_tick)
             speed = direction * self._measured[number] * self._settings.counts_per_rad
+            self._counted[number].append(count)
             for address, motor in side:
                 registers = self.boards[address].registers
                 setattr(registers, f"encoder_m{motor + 1}", count)
-                setattr(registers, f"speed_m{motor + 1}", round(speed))
+                # In steps of 300 counts/s: what was counted in the last 1/300 s, as long as three steps and a little.
+                setattr(registers, f"speed_m{motor + 1}", 300 * (count - self._counted[number][0]))
                 self._ramp(address, motor, speed)
         for board in self.boards.values():
             if inputs.estop_button:

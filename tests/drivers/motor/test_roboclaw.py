@@ -1,5 +1,7 @@
 """Tests of RoboClaw's own: its serial timeout, set and read back, stops before questions, boards that restart."""
 
+import dataclasses
+
 import pytest
 
 from disco_hw.config import Control, Link
@@ -122,6 +124,52 @@ def test_a_board_that_does_not_know_the_question_for_its_duty_ramp_is_driven():
     drive(bench)
 
 
+COARSE = dataclasses.replace(ONE, changes="counts_per_rev = 1000.0\n")
+
+
+@pytest.mark.parametrize("speed_rad_s", [0.3, 1.5])
+def test_wheels_that_roll_slowly_are_not_taken_to_stand(speed_rad_s):
+    """A board's own speed is what it counted in 1/300 s: below 300 counts/s it is zero for most of the time."""
+    bench = COARSE.bench(coasting_s=1e9)
+    bench.run_until(*IDLE_STATES)
+    bench.robot.stuck, bench.robot.speed = {0, 1}, [speed_rad_s, speed_rad_s]
+    bench.run(0.5)
+    speeds = [sample.left_speed_rad_s for sample in bench.wheels[-10:]]
+    assert speeds == pytest.approx(10 * [speed_rad_s], abs=0.17), "one count in two periods"
+    bench.request(Request.ARM).run(0.5)
+    assert bench.driver.state is DriverState.STOPPING
+    assert any("a motor is turning" in event for event in (*bench.events, bench.driver.detail))
+    bench.send_estop()
+    for _ in range(500):
+        bench.step()
+        assert not bench.driver._port.is_stopped
+    bench.robot.speed = [0.0, 0.0]
+    bench.run(0.3)
+    assert bench.driver._port.is_stopped
+
+
+def test_a_motor_that_stands_on_the_edge_of_a_count_stands():
+    bench = COARSE.bench()
+    bench.run_until(*IDLE_STATES)
+    step = bench.robot.step
+
+    def trembling(now_ns):
+        bench.robot.angle[0] = 0.6 * bench.robot.angle_of_a_count * (now_ns // 7_000_000 % 2)
+        step(now_ns)
+
+    bench.robot.angle_of_a_count, bench.robot.step = 1.0 / COARSE.settings.counts_per_rad, trembling
+    bench.run(0.3)
+    bench.arm()
+
+
+def test_answers_that_are_lost_do_not_change_the_speed():
+    bench = ONE.bench(loses=lambda generator: generator.random() < 0.05)
+    bench.arm()
+    bench.run(1.5, FORWARD)
+    assert bench.driver.state is DriverState.ARMED
+    assert [sample.left_speed_rad_s for sample in bench.wheels[-30:]] == pytest.approx(30 * [FORWARD[0]], abs=0.1)
+
+
 def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
     drive(bench)
     bench.robot.press_estop(True)
@@ -205,7 +253,7 @@ def test_a_speed_beyond_what_the_board_can_do_is_held_to_it(bench):
 
 @pytest.mark.parametrize(
     ("baud", "rate_hz", "level"),
-    [(38_400, 50.0, Level.FAIL), (38_400, 25.0, Level.WARNING), (115_200, 50.0, Level.OK)],
+    [(38_400, 100.0, Level.FAIL), (38_400, 50.0, Level.WARNING), (115_200, 50.0, Level.OK)],
 )
 def test_a_line_that_is_too_slow_for_the_rate_is_refused(baud, rate_hz, level):
     link = Link(driver=ONE.name, kind="serial", baud=baud, of_driver=ONE.settings)

@@ -22,8 +22,8 @@ SUMS = {
     "vesc-four-braking": "abb1d5 22f891 0d471e 557862 5c4d8f 91bd08 ca59f9 aad34b 9972fe 13e3a5",
     "vesc-uart": "5ccdae 20cbc8 ee78c3 73172c 060d59 9abb33 628638 8b6f63 f5e4b9 07af09",
     "agilex": "e3b0c4 2d8bed 25fe17 bf6f49 350532 9a3dd8 c7c7a0 6a8174 53ecac e3b0c4",
-    "roboclaw": "ff0b43 e13c45 a40c35 fd3566 5ef9b0 4b346f 1c8945 38835d c6c7d4 fb0445",
-    "roboclaw-a-board-a-side": "d713f4 44b74a 9550c6 bfa38d 943fbb 54e74c 4e4467 d55406 20a940 8bda2b",
+    "roboclaw": "e5b47b 7161c0 2a3576 22bd85 2c8122 cc06d6 98dc6b 6b454a c5f6d1 278519",
+    "roboclaw-a-board-a-side": "9a3d01 c2a2dc f76b7e 6f994d 760e80 45cd67 e4557a c21981 de63e2 4d85fd",
     "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 255f60 81ad5e e3b0c4 186d20 3f0143 272f2d",
 }
 """SHA-256 of the frames of each phase of `scripted_day`, in its order: the first six digits."""
