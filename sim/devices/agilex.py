@@ -21,16 +21,18 @@ TIMEOUT_MS = 500
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
 MOTORS = 8
 """Bases with steering have up to eight; those here send the first four."""
-_PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 20, 0x361: 500}
+_PERIODS_MS = {0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 20, 0x361: 500}
 
 
 @dataclass(slots=True)
 class AgilexBase:
     """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
 
-    It holds either to its own limit, whatever becomes of the curve: `max_speed_m_s` and `max_turn_rad_s`.
+    It holds either to its own limit, whatever becomes of the curve: `max_speed_m_s` and `max_turn_rad_s`. `state_ms`:
+    period of its state, 200 ms of a BUNKER PRO 2.0.
     """
 
+    state_ms: int = 100
     max_speed_m_s: float = math.inf
     max_turn_rad_s: float = math.inf
 
@@ -124,7 +126,7 @@ class AgilexBase:
         """Go through one millisecond; return the messages that are due."""
         self._now_ms = now_ms
         frames = []
-        for can_id, period in _PERIODS_MS.items():
+        for can_id, period in ({0x211: self.state_ms} | _PERIODS_MS).items():
             if now_ms % period == 0:
                 numbers = range(4) if can_id in (0x251, 0x261) else range(1)
                 frames += [self.message(can_id + number) for number in numbers]

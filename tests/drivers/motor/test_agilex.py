@@ -41,6 +41,21 @@ def test_a_person_who_takes_the_remote_control_drives_and_after_that_it_does_not
     assert base.control_mode == STANDBY
 
 
+def test_a_base_that_sends_its_state_every_200_ms_may_lose_two_of_them_and_is_missed_by_its_motion(bench):
+    bench.robot.controller.base.state_ms = 200
+    bench.drive(0.5, FORWARD)
+    drain, lost = bench.robot.drain, {0x211}
+    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id not in lost]
+    bench.run(0.4)
+    lost.clear()
+    bench.run(0.5, FORWARD)
+    assert bench.driver.state is DriverState.ARMED
+    lost.add(0x221)
+    bench.run(0.15, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert "the base's motion stopped reporting" in bench.driver.detail
+
+
 def test_the_buttons_stop_it_and_need_a_reset(bench):
     bench.drive(0.5, FORWARD)
     bench.robot.press_estop(True)
