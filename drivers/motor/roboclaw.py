@@ -48,6 +48,7 @@ from drivers.types import (
 
 # User manual, status: the e-stop input, and the bits of errors, above which those of warnings begin.
 _ESTOP, _ERRORS = 0x1, 0xFFFF
+_PRESSED = "its e-stop input is or was pressed; if reset does not help, switch the board off and on"
 _ERROR_TEXTS = {
     0x2: "it is too hot",
     0x4: "it is too hot",
@@ -166,7 +167,7 @@ class Board:
     def error_text(self) -> str:
         """Text of the board's first error, for the operator."""
         if self.is_pressed:
-            return f"board {self.address}: its e-stop input is pressed"
+            return f"board {self.address}: its e-stop input is or was pressed"
         bit = self.errors & -self.errors
         return f"board {self.address}: {_ERROR_TEXTS.get(bit, f'error {self.errors:#06x}')}"
 
@@ -230,7 +231,7 @@ class _RoboclawPort(Port):
         return Controllers(
             missing=missing if silent else None,
             refused=next(filter(None, (board.slow_stop for board in self._all)), None),
-            stopped="its e-stop input is pressed" if pressed else None,
+            stopped=_PRESSED if pressed else None,
             faulty="; ".join(board.error_text for board in self._all if board.errors) or None,
         )
 

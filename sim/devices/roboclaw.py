@@ -25,7 +25,11 @@ QUIET_US = 10_000
 
 @dataclass(slots=True)
 class RoboclawRegisters:
-    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32."""
+    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32.
+
+    `estop_lock`: what ends a latched e-stop: 0x55 its release, 0xAA a reset, all else only switching the board off and
+    on, as it comes from the factory.
+    """
 
     timeout_ds: int = 0
     encoder_m1: int = 0
@@ -45,7 +49,7 @@ class RoboclawRegisters:
     temperature_1: int = 300
     temperature_2: int = 300
     status: int = 0
-    estop_lock: int = 0x55
+    estop_lock: int = 0x00
     duty_accel_m1: int = 655_360
     duty_accel_m2: int = 655_360
     pid_m1: tuple[int, int, int, int] = (65536, 32768, 0, 100_000)

@@ -171,6 +171,8 @@ def test_answers_that_are_lost_do_not_change_the_speed():
 
 
 def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
+    for board in boards(bench):
+        board.registers.estop_lock = 0x55
     drive(bench)
     bench.robot.press_estop(True)
     bench.run(0.3, FORWARD)
@@ -180,6 +182,20 @@ def test_its_e_stop_input_stops_it_and_needs_a_reset(bench):
     bench.run(2.0, FORWARD)
     assert bench.driver.state is DriverState.FAULT
     assert bench.robot.speed_rad_s < 0.05
+    bench.request(Request.RESET).run_until(*IDLE_STATES)
+
+
+def test_an_e_stop_that_a_board_as_delivered_has_latched_ends_when_it_is_switched_off_and_on(bench):
+    drive(bench)
+    bench.robot.press_estop(True)
+    bench.run(0.3)
+    bench.robot.press_estop(False)
+    bench.request(Request.RESET).run(1.0)
+    assert bench.driver.state is DriverState.ESTOP
+    assert bench.driver.detail == (
+        "its e-stop input is or was pressed; if reset does not help, switch the board off and on"
+    )
+    bench.robot.controller.restart()
     bench.request(Request.RESET).run_until(*IDLE_STATES)
 
 
