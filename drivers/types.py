@@ -8,6 +8,7 @@ Time stamps are nanoseconds of the host's monotonic clock unless the name says o
 from __future__ import annotations
 
 import enum
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from types import MappingProxyType
@@ -274,7 +275,8 @@ class MotorDriver:
     `make` returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the
     e-stop for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given
     each frame that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that
-    it holds. `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries.
+    it holds. `largest_difference_rad_s`: of the wheel speeds, where it limits how fast the robot turns. `cyclic_frames`
+    (of settings, command rate in Hz, whether authenticated): what the link carries.
     `authenticates`: whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it
     speaks over, the usual one first. `reports_reception`: whether the controller counts the frames that it rejects and
     answers for its clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the
@@ -289,10 +291,11 @@ class MotorDriver:
     name: str
     make: Callable[[Any, bytes | None], Driver]
     stop_frames: Callable[[Any], tuple[Frame, ...]]
-    stop_confirmation: Callable[[Any], Callable[[Frame], bool]]
+    stop_confirmation: Callable[[Any], Callable[[ReceivedFrame], bool]]
     cyclic_frames: Callable[[Any, float, bool], tuple[CyclicFrame, ...]]
     safety_card: Callable[[Any], SafetyCard]
     slowest_rad_s: Callable[[Any], float] = lambda _settings: 0.0
+    largest_difference_rad_s: Callable[[Any], float] = lambda _settings: math.inf
     settings: type[Any] = NoSettings
     kinds: tuple[str, ...] = ("can",)
     exchange: Callable[[Any], Exchange] | None = None

@@ -289,3 +289,8 @@ class RobotConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     def slowest_wheel_rad_s(self) -> float:
         """Slowest true speed of a wheel that the motor controller holds, rad/s."""
         return find_driver(self.link.driver).slowest_rad_s(self.link.settings()) * self.wheels.turn_ratio
+
+    @property
+    def largest_wheel_difference_rad_s(self) -> float:
+        """Largest difference of the true wheel speeds that the motor controller allows, rad/s; infinite without one."""
+        return find_driver(self.link.driver).largest_difference_rad_s(self.link.settings()) * self.wheels.turn_ratio

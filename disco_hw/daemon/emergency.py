@@ -28,13 +28,14 @@ from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.transport import SerialMedium, open_transport
 from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
-from drivers.types import Frame, LinkState, OutgoingFrame
+from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
 from firmware_protocol.serial_framing import FrameDecoder, encode_frame
 
 # Chosen: longer than a link takes to open, and short enough for an operator who waits to reach for the button.
 _CONNECT_S = 1.0
 # Chosen: five periods of SYSTEM_STATE (0.1 s); slower confirmations are reported as missing.
 _CONFIRM_S = 0.5
+_IsConfirmation = Callable[[ReceivedFrame], bool]
 _HINT = (
     "to stop the robot all the same, give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's "
     "own e-stop button, now"
@@ -180,7 +181,7 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
     return None
 
 
-def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
+def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
     transport = open_transport(**settings.medium_fields())
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
@@ -194,12 +195,12 @@ def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmatio
             if not transport.send(OutgoingFrame(frame, now_ns + ESTOP_LIFE_NS), now_ns):
                 raise ConnectionError(transport.last_error or "the frame could not be queued")
         # What was under way before says nothing about this request.
-        return _confirmed(lambda: [r.frame for r in transport.receive() if r.t_ns >= requested_ns], is_confirmation)
+        return _confirmed(lambda: [r for r in transport.receive() if r.t_ns >= requested_ns], is_confirmation)
     finally:
         transport.close()
 
 
-def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
+def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
     with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
@@ -208,16 +209,17 @@ def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: 
         port.flush()
         decoder = FrameDecoder()
 
-        def receive() -> list[Frame]:
+        def receive() -> list[ReceivedFrame]:
             # Two readers of one port take bytes from each other, which pyserial reports as a lost device.
             with contextlib.suppress(serial.SerialException):
-                return [Frame(*each) for each in decoder.feed(port.read(max(1, port.in_waiting)))]
+                received = port.read(max(1, port.in_waiting))
+                return [ReceivedFrame(time.monotonic_ns(), Frame(*each)) for each in decoder.feed(received)]
             return []
 
         return _confirmed(receive, is_confirmation)
 
 
-def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
+def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
     """Packet by packet, each with its reply, again and again until the robot confirms or the time is over."""
     driver = find_driver(settings.driver)
     assert driver.exchange is not None
@@ -236,18 +238,19 @@ def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation
                         raise
                 else:
                     went_out = True
-                    confirmed = (reply is not None and is_confirmation(reply)) or confirmed
+                    received = None if reply is None else ReceivedFrame(time.monotonic_ns(), reply)
+                    confirmed = (received is not None and is_confirmation(received)) or confirmed
             if time.monotonic_ns() > deadline_ns:
                 break
     return confirmed
 
 
-def _confirmed(receive: Callable[[], list[Frame]], is_confirmation: Callable[[Frame], bool]) -> bool:
+def _confirmed(receive: Callable[[], list[ReceivedFrame]], is_confirmation: _IsConfirmation) -> bool:
     """Whether the robot reports the e-stop within the waiting time."""
     deadline_ns = time.monotonic_ns() + round(_CONFIRM_S * 1e9)
     while time.monotonic_ns() < deadline_ns:
         # Each frame counts: several controllers confirm one after the other.
-        if True in [is_confirmation(frame) for frame in receive()]:
+        if True in [is_confirmation(received) for received in receive()]:
             return True
         time.sleep(0.002)
     return False

@@ -103,6 +103,7 @@ def create_pipeline(config: RobotConfig, model: Model, planner: Planner) -> Pipe
         max_speed_rad_s=config.robot.max_wheel_speed_rad_s,
         max_acceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
         max_deceleration_rad_s2=config.robot.max_wheel_acceleration_rad_s2,
+        max_difference_rad_s=config.largest_wheel_difference_rad_s,
     )
     return Pipeline(
         fusion=PoseFusion(

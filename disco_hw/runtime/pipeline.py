@@ -50,17 +50,23 @@ class Limited(enum.Flag):
 
 @dataclass(frozen=True, slots=True)
 class WheelLimits:
-    """Limits of each wheel: rad/s, and rad/s^2 away from and towards standstill."""
+    """Limits of each wheel: rad/s, and rad/s^2 away from and towards standstill; and of both, by how much they differ.
+
+    `max_difference_rad_s`: of a controller that limits how fast the robot turns; infinite for one that does not.
+    """
 
     max_speed_rad_s: float
     max_acceleration_rad_s2: float
     max_deceleration_rad_s2: float
+    max_difference_rad_s: float = math.inf
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
+        for name in ("max_speed_rad_s", "max_acceleration_rad_s2", "max_deceleration_rad_s2"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
                 raise ValueError(f"{name} must be positive and finite, not {value}")
+        if not self.max_difference_rad_s > 0.0:
+            raise ValueError(f"max_difference_rad_s must be positive, not {self.max_difference_rad_s}")
 
 
 class Governed(msgspec.Struct, frozen=True, gc=False):
@@ -74,9 +80,9 @@ class Governed(msgspec.Struct, frozen=True, gc=False):
 class Governor:
     """Holds wheel commands within limits, from the command sent last.
 
-    Speed: both wheels are scaled by one factor, so the curvature of the path is kept. Acceleration: the command moves
-    along the straight line in wheel space from the last command to the desired one, as far as the slower-limited wheel
-    allows, so neither wheel exceeds its limit and the direction of the change is kept.
+    Speed, and by how much the wheels differ: both are scaled by one factor, so the curvature of the path is kept.
+    Acceleration: the command moves along the straight line in wheel space from the last command to the desired one, as
+    far as the slower-limited wheel allows, so neither wheel exceeds its limit and the direction of the change is kept.
     """
 
     def __init__(self, limits: WheelLimits, period_s: float) -> None:
@@ -110,6 +116,11 @@ class Governor:
             limited |= Limited.SPEED
             # Dividing first keeps the faster wheel at exactly the limit: fastest / fastest is 1.
             left, right = left / fastest * top, right / fastest * top
+        difference = abs(right - left)
+        if difference > self._limits.max_difference_rad_s:
+            limited |= Limited.SPEED
+            share = self._limits.max_difference_rad_s / difference
+            left, right = share * left, share * right
 
         # A NaN fails both comparisons of the clamp and counts as no time at all.
         dt = dt_s if 0.0 <= dt_s <= self._largest_dt_s else (self._largest_dt_s if dt_s > 0.0 else 0.0)

@@ -159,7 +159,11 @@ def checksum(can_id, payload):
 
 
 def stop_confirmation(_settings):
-    return lambda frame: frame.can_id == STATE_ID and len(frame.data) == 8 and frame.data[1] == ESTOP
+    def is_confirmation(received):
+        frame = received.frame
+        return frame.can_id == STATE_ID and len(frame.data) == 8 and frame.data[1] == ESTOP
+
+    return is_confirmation
 
 
 DRIVER = MotorDriver(

@@ -32,9 +32,9 @@ from drivers.types import (
     WheelSample,
 )
 
-# The base sends its state at 10 Hz and its motion at 50 Hz: three and five messages. Gone: longer than a disturbance of
-# the bus.
-STATE_SILENT_NS, MOTION_SILENT_NS, GONE_NS = 350_000_000, 100_000_000, 1_000_000_000
+# A base sends its state every 100 ms, a BUNKER PRO 2.0 every 200 ms, and its motion every 20 ms: three messages of the
+# slower one, and five, which find a base that is gone. Gone: longer than a disturbance of the bus.
+STATE_SILENT_NS, MOTION_SILENT_NS, GONE_NS = 650_000_000, 100_000_000, 1_000_000_000
 # Chosen: some steps of 0.001 on the wire, so that noise does not keep a base that stands from standing by.
 _STATIONARY_M_S, _STATIONARY_RAD_S = 0.01, 0.02
 _WARNINGS = 0x0606
@@ -180,6 +180,7 @@ DRIVER = MotorDriver(
     lambda settings, _key: VendorDriver(_AgilexPort(settings)),
     settings=AgilexSettings,
     takes_body_speeds=True,
+    largest_difference_rad_s=lambda settings: settings.largest_difference_rad_s,
     example=protocol.EXAMPLE,
     recognise=protocol.recognise,
     latches_stop=False,

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from drivers.motor.body_port import BodySettings
 from drivers.motor.vendor_parts import Decoded, by_number, layouts
@@ -72,11 +74,14 @@ _RECEIVED = 3
 EXAMPLE = """wheel_radius_m = 0.06
 track_m = 0.31
 max_speed_m_s = 1.5
+max_turn_rad_s = 2.5
 """
 
 
 class AgilexSettings(BodySettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Settings of AgileX bases in [link], which turn wheel speeds into speeds of the body and back."""
+
+    max_turn_rad_s: Annotated[float, Meta(gt=0.0, le=20.0)]
 
     def fault(self) -> SettingsFault | None:
         """Return None, because each field shows its own faults."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Annotated
@@ -23,12 +24,19 @@ class BodySettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     wheel_radius_m: Annotated[float, Meta(gt=0.0, le=2.0)]
     track_m: Annotated[float, Meta(gt=0.0, le=5.0)]
     max_speed_m_s: Annotated[float, Meta(gt=0.0, le=10.0)]
+    max_turn_rad_s: Annotated[float, Meta(gt=0.0, le=20.0)] | None = None
     stop_deceleration_rad_s2: Annotated[float, Meta(gt=0.0, le=655.0)] = 10.0
 
     @property
     def fastest_rad_s(self) -> float:
         """The wheel speed of the base's largest speed."""
         return self.max_speed_m_s / self.wheel_radius_m
+
+    @property
+    def largest_difference_rad_s(self) -> float:
+        """The difference of the wheel speeds of the base's largest turn rate."""
+        turn_rad_s = math.inf if self.max_turn_rad_s is None else self.max_turn_rad_s
+        return turn_rad_s * self.track_m / self.wheel_radius_m
 
 
 class BodyPort(Port):
@@ -56,10 +64,15 @@ class BodyPort(Port):
             side.reset_state()
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
-        """Return the frame that commands the body's motion, by the nominal geometry."""
+        """Return the frame that commands the body's motion, by the nominal geometry and on its curve."""
         it = self.settings
         left_m_s, right_m_s = it.wheel_radius_m * left_rad_s, it.wheel_radius_m * right_rad_s
-        scale = min(1.0, it.max_speed_m_s / max(abs(left_m_s), abs(right_m_s), 1e-9))
+        # A base holds speed and turn rate to its limits one by one, which would change the curve.
+        scale = min(
+            1.0,
+            it.max_speed_m_s / max(abs(left_m_s), abs(right_m_s), 1e-9),
+            it.largest_difference_rad_s / max(abs(right_rad_s - left_rad_s), 1e-9),
+        )
         return (self._motion(scale * (left_m_s + right_m_s) / 2.0, scale * (right_m_s - left_m_s) / it.track_m),)
 
     def brake(self, now_ns: int, lasts_ns: int) -> tuple[Sequence[Frame], bool]:

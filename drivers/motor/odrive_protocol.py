@@ -248,6 +248,7 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
 
 def safety_card(settings: OdriveSettings) -> SafetyCard:
     """Return the safety card of ODrives."""
+    watchdog = f"watchdog ({settings.watchdog_s:g} s), " if settings.watchdog_endpoints is None else ""
     return SafetyCard(
         host_silent=f"each axis, {settings.watchdog_s:g} s after the last frame, by its watchdog: the axis idles",
         stops_by="coasting: an ODrive in idle does not brake",
@@ -257,8 +258,8 @@ def safety_card(settings: OdriveSettings) -> SafetyCard:
         "heartbeat",
         wheel_fault="each axis idles at once, without torque: it coasts",
         unverified=(
-            f"watchdog ({settings.watchdog_s:g} s), velocity limit and heartbeat period are declared in robot.toml "
-            "and were not read back; any frame to an axis may feed its watchdog",
+            f"{watchdog}velocity limit and heartbeat period are declared in robot.toml and were not read back; any "
+            "frame to an axis may feed its watchdog",
             "not tested on hardware: the driver was tested against a simulator made from the vendor's source",
         ),
         setup=(
@@ -266,6 +267,7 @@ def safety_card(settings: OdriveSettings) -> SafetyCard:
             "odrv0.axis0.config.enable_watchdog = True",
             f"odrv0.axis0.controller.config.vel_limit = {settings.vel_limit_turns_s:g}",
             "heartbeat 10 to 100 ms, encoder 10 ms (axis0.config.can.*_rate_ms or *_msg_rate_ms); the same on axis1",
+            "odrv0.save_configuration()",
         ),
     )
 
@@ -278,6 +280,8 @@ WATCHDOG_TRIES = 5
 _PERIOD_NS = 100_000_000
 # Questions feed an idle node's watchdog, so often enough for a short one.
 _ALIVE_PERIOD_NS = 30_000_000
+# Without it a board forgets what was set when it is switched off.
+_SAVE = "call odrv0.save_configuration() (odrivetool)"
 # Chosen: equal but for the rounding of a number that was typed in.
 _SAME_TIMEOUT_S = 0.002
 
@@ -351,9 +355,11 @@ class Questions:
         configured_s = self._settings.watchdog_s
         found_s = self._timeouts_s.get(node, configured_s)
         if not self._is_on.get(node, True):
-            self.refusal = f"node {node}: its watchdog is off; set axis0.config.enable_watchdog (odrivetool)"
+            self.refusal = f"node {node}: its watchdog is off; set axis0.config.enable_watchdog and {_SAVE}"
         elif not abs(found_s - configured_s) <= _SAME_TIMEOUT_S:
-            self.refusal = f"node {node}: its watchdog is set to {found_s:g} s; set it to {configured_s:g} s"
+            self.refusal = (
+                f"node {node}: its watchdog is set to {found_s:g} s; set it to {configured_s:g} s and {_SAVE}"
+            )
         elif not self.known and all(self._is_on.get(one) and one in self._timeouts_s for one in self._nodes):
             self._announce(f", watchdog {configured_s:g} s")
         return True

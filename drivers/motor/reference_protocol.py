@@ -54,11 +54,12 @@ def stop_frames(_settings: NoSettings) -> tuple[Frame, ...]:
     return (Frame(encoded.can_id, encoded.data),)
 
 
-def stop_confirmation(_settings: NoSettings) -> Callable[[Frame], bool]:
+def stop_confirmation(_settings: NoSettings) -> Callable[[ReceivedFrame], bool]:
     """Return a function that tells of a received frame whether the controller has confirmed an e-stop."""
     codec = Codec()
 
-    def is_confirmation(frame: Frame) -> bool:
+    def is_confirmation(received: ReceivedFrame) -> bool:
+        frame = received.frame
         decoded = None if frame.extended else codec.decode(frame.can_id, frame.data)
         if not isinstance(decoded, Decoded) or decoded.name != "SYSTEM_STATE":
             return False

@@ -7,6 +7,7 @@ without a command. Armed is what this driver says it is: each board has its time
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -47,6 +48,7 @@ from drivers.types import (
 
 # User manual, status: the e-stop input, and the bits of errors, above which those of warnings begin.
 _ESTOP, _ERRORS = 0x1, 0xFFFF
+_PRESSED = "its e-stop input is or was pressed; if reset does not help, switch the board off and on"
 _ERROR_TEXTS = {
     0x2: "it is too hot",
     0x4: "it is too hot",
@@ -62,11 +64,22 @@ _ERROR_TEXTS = {
     0x4000: "the main supply's voltage is too low",
     0x8000: "the main supply's voltage is too high",
 }
-TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "speeds", "encoders")
+TO_KNOW = ("version", "velocity_pid_m1", "velocity_pid_m2", "status", "serial_timeout", "encoders")
 
 
-# Chosen: above the noise of a counted speed, and below any motion that could matter.
+DUTY_ACCELS = "default_duty_accels"
+"""Asked for before arming; not every board knows the question."""
+# Chosen: so many answers in a row are not lost.
+_DUTY_ACCELS_TRIES = 5
+# Full duty, and Chosen: the shortest serial timeout; an e-stop, zero duty, may take no longer than a silent host.
+_FULL_DUTY, _LONGEST_RAMP_S = 32767.0, 0.1
+
+# Chosen: below any motion that could matter.
 _STATIONARY_RAD_S = 0.1
+# Chosen: with a coarse encoder of 1000 counts a turn, three counts at that speed. One count a motor may tremble.
+_STANDING_NS, _TREMBLES_COUNTS = 200_000_000, 1.0
+# Chosen: a little under two replies at 50 Hz, as one count more or less in one is 50 counts/s.
+_SPEED_NS = 35_000_000
 # As many as the reference controller asks for (firmware/command.c).
 ZEROS_TO_ARM = 5
 # Chosen: five replies at 50 Hz; gone when a board could have been switched off and on.
@@ -88,16 +101,22 @@ _SETTER_NAMES = {layout.command: name for name, layout in protocol.SETTERS.items
 class Board:
     """State of one board: newest reply to each question in `known`, and the odometers of both motors in `turned`.
 
+    `counted`: time and both counts of each reply of the last `_STANDING_NS`, and of one before. The speeds are taken
+    from them, as the board's own is that of the last 1/300 s, in steps of 300 counts/s.
+
     `stopped`: it has taken a stop since the last command. `timeout_ds`: its serial timeout in steps of 0.1 s, as read
-    since arming began. `waits_ns`: since when it has not answered, `refuses_ns` since when it has taken no command.
+    since arming began. `requested_accels`: how often it was asked for them. `waits_ns`: since when it has not answered,
+    `refuses_ns` since when it has taken no command.
     """
 
     address: int
     known: dict[str, Mapping[str, protocol.Value]] = field(default_factory=dict)
     turned: tuple[parts.Odometer, parts.Odometer] = field(default_factory=lambda: (parts.Odometer(), parts.Odometer()))
+    counted: deque[tuple[int, int, int]] = field(default_factory=deque)
     stopped: bool = False
     zeros: int = 0
     timeout_ds: int | None = None
+    requested_accels: int = 0
     waits_ns: int | None = None
     refuses_ns: int | None = None
 
@@ -112,15 +131,32 @@ class Board:
         return float(min(int(self.known[f"velocity_pid_m{motor}"]["qpps"]) for motor in (1, 2)))
 
     @property
-    def speeds(self) -> tuple[float, float]:
-        """Measured speeds of both motors, in counts/s."""
-        read = self.known["speeds"]
-        return float(read["speed_m1"]), float(read["speed_m2"])
+    def is_known(self) -> bool:
+        """Whether every reply needed before arming has been read, and for long enough whether the motors stand."""
+        return not self.unknown and self.is_counted_long
 
     @property
-    def is_known(self) -> bool:
-        """Whether every reply needed before arming has been read from the board."""
-        return all(name in self.known for name in TO_KNOW)
+    def is_counted_long(self) -> bool:
+        """Whether the counts of a time are known in which a motor that turns is seen to."""
+        return bool(self.counted) and self.counted[-1][0] - self.counted[0][0] >= _STANDING_NS
+
+    @property
+    def unknown(self) -> list[str]:
+        """Names of the replies that have not been read yet; of the accelerations it may know nothing."""
+        names = TO_KNOW if self.requested_accels >= _DUTY_ACCELS_TRIES else (*TO_KNOW, DUTY_ACCELS)
+        return [name for name in names if name not in self.known]
+
+    @property
+    def slow_stop(self) -> str | None:
+        """Text on why zero duty would stop its motors too slowly, and what to set; None if it would not."""
+        decels = self.known.get(DUTY_ACCELS, {}).values()
+        ramp_s = max((_FULL_DUTY / max(float(decel), 1.0) for decel in decels), default=0.0)
+        if ramp_s <= _LONGEST_RAMP_S:
+            return None
+        return (
+            f"board {self.address}: its e-stop takes {ramp_s:.3g} s from full duty; set Default Accel to 655359 "
+            "(Motion Studio), for both motors"
+        )
 
     @property
     def is_pressed(self) -> bool:
@@ -131,22 +167,40 @@ class Board:
     def error_text(self) -> str:
         """Text of the board's first error, for the operator."""
         if self.is_pressed:
-            return f"board {self.address}: its e-stop input is pressed"
+            return f"board {self.address}: its e-stop input is or was pressed"
         bit = self.errors & -self.errors
         return f"board {self.address}: {_ERROR_TEXTS.get(bit, f'error {self.errors:#06x}')}"
 
+    def is_stationary(self, fastest_counts_s: float) -> bool:
+        """Whether both motors have been slower than this for long enough to tell."""
+        if not self.is_counted_long:
+            return False
+        newest, *before = reversed(self.counted)
+        allowed = max(_TREMBLES_COUNTS, fastest_counts_s * 1e-9 * (newest[0] - before[-1][0]))
+        return all(abs(_turned(motor, newest, each)) <= allowed for each in before for motor in (1, 2))
+
     def handle_counts(self, read: Mapping[str, protocol.Value], t_ns: int, looked_ns: int) -> bool:
-        """Update the odometers from encoder counts; return False if the motors cannot have turned that far."""
+        """Update speeds and odometers from encoder counts; return False if the motors cannot have turned that far."""
+        newest = (t_ns, int(read["encoder_m1"]), int(read["encoder_m2"]))
+        self.counted.append(newest)
+        while len(self.counted) > 2 and t_ns - self.counted[1][0] >= _STANDING_NS:
+            self.counted.popleft()
+        before = next((each for each in reversed(self.counted) if t_ns - each[0] >= _SPEED_NS), None)
+        for motor, turned in enumerate(self.turned, 1):
+            turned.speed = 0.0 if before is None else _turned(motor, newest, before) / (1e-9 * (t_ns - before[0]))
         if not {"velocity_pid_m1", "velocity_pid_m2"} <= self.known.keys():
             return True
-        first, second = self.turned
         fastest = 1.5 * self.fastest_counts_s
-        is_first_plausible = first.add_wrapping(int(read["encoder_m1"]), t_ns, looked_ns, fastest, 100.0)
-        return second.add_wrapping(int(read["encoder_m2"]), t_ns, looked_ns, fastest, 100.0) and is_first_plausible
+        plausible = [
+            turned.add_wrapping(count, t_ns, looked_ns, fastest, 100.0)
+            for turned, count in zip(self.turned, newest[1:], strict=True)
+        ]
+        return all(plausible)
 
     def reset_state(self) -> None:
         """Clear the board's replies, as for a new connection; the angles that its motors have turned are kept."""
-        self.known, self.waits_ns, self.timeout_ds = {}, None, None
+        self.known, self.waits_ns, self.timeout_ds, self.requested_accels = {}, None, None, 0
+        self.counted.clear()
         for motor in self.turned:
             motor.reset_state()
 
@@ -176,14 +230,15 @@ class _RoboclawPort(Port):
         pressed = any(board.is_pressed for board in self._all)
         return Controllers(
             missing=missing if silent else None,
-            stopped="its e-stop input is pressed" if pressed else None,
+            refused=next(filter(None, (board.slow_stop for board in self._all)), None),
+            stopped=_PRESSED if pressed else None,
             faulty="; ".join(board.error_text for board in self._all if board.errors) or None,
         )
 
     @property
     def identity(self) -> Identity | None:
         """Identity that the first board reports; None before all boards are known."""
-        if not self._is_known:
+        if not self._is_known or self.seen.refused is not None:
             return None
         return Identity("RoboClaw", str(self._all[0].known["version"]["version"]).strip(), "device")
 
@@ -199,7 +254,7 @@ class _RoboclawPort(Port):
     @property
     def is_stopped(self) -> bool:
         """Whether every board has taken a stop, and its motors stand."""
-        return all(board.stopped and "speeds" in board.known for board in self._all) and self._is_stationary
+        return all(board.stopped for board in self._all) and self._is_stationary
 
     def reset_state(self, now_ns: int) -> None:
         for board in self._all:
@@ -226,9 +281,7 @@ class _RoboclawPort(Port):
         board.waits_ns = None
         plausible = name != "encoders" or board.handle_counts(read[0], t_ns, permit.looked_ns)
         board.known[name] = read[0]
-        if name == "speeds":
-            board.turned[0].speed, board.turned[1].speed = board.speeds
-        elif name == "serial_timeout":
+        if name == "serial_timeout":
             board.timeout_ds = int(read[0]["timeout_ds"])
         is_status = name == "encoders" and self._is_known
         is_new = is_status and all(each.is_new for one in self._all for each in one.turned)
@@ -316,8 +369,8 @@ class _RoboclawPort(Port):
     def questions(self, now_ns: int, permit: MotionPermit) -> tuple[OutgoingFrame, ...]:
         """Return the questions to boards with a command in this tick, or, more slowly, to boards that are stopped.
 
-        What is still unknown of a board, one question at a time; of a known one speeds and counts, and of one board in
-        turn its errors or its serial timeout.
+        What is still unknown of a board, one question at a time; of a known one its counts, and of one board in turn
+        its errors or its serial timeout.
         """
         boards = self._all
         if permit.stage in (Stage.REST, Stage.BRAKING):
@@ -332,8 +385,9 @@ class _RoboclawPort(Port):
         turn, number = divmod(self._slow, len(self._all))
         for board in boards:
             board.waits_ns = now_ns if board.waits_ns is None else board.waits_ns
-            unknown = [name for name in TO_KNOW if name not in board.known]
-            names = unknown[:1] or ["speeds", "encoders"]
+            unknown = board.unknown
+            names = unknown[:1] or ["encoders"]
+            board.requested_accels += DUTY_ACCELS in names
             if not unknown and board is self._all[number]:
                 names.append("serial_timeout" if turn % _TIMEOUT_EVERY == 0 else "status")
             frames += [query(board.address, name) for name in names]
@@ -354,7 +408,7 @@ class _RoboclawPort(Port):
     @property
     def _is_stationary(self) -> bool:
         fastest = _STATIONARY_RAD_S * self._settings.counts_per_rad
-        return all(abs(speed) < fastest for board in self._all for speed in board.speeds)
+        return all(board.is_stationary(fastest) for board in self._all)
 
     @property
     def _fastest_rad_s(self) -> float:
@@ -378,6 +432,11 @@ class _RoboclawPort(Port):
         settings = self._settings
         turned = [[self._boards[address].turned[motor] for address, motor in side] for side in settings.sides]
         return parts.wheel_sample(t_ns, turned, settings.direction, 1.0 / settings.counts_per_rad)
+
+
+def _turned(motor: int, newest: Sequence[int], before: Sequence[int]) -> int:
+    """Return by how much a motor was counted between two entries of `Board.counted`; counts wrap at 2^32."""
+    return (newest[motor] - before[motor] + 2**31) % 2**32 - 2**31
 
 
 def _stop(address: int) -> Frame:

@@ -66,6 +66,7 @@ GETTERS = layouts(
     ("velocity_pid_m2", 56, "IIII", "p i d qpps"),
     ("encoders", 78, "ii", "encoder_m1 encoder_m2"),
     ("speeds", 79, "ii", "speed_m1 speed_m2"),
+    ("default_duty_accels", 81, "II", "decel_m1 decel_m2"),
     ("temperature_1", 82, "H", "temperature_decidegree"),
     ("temperature_2", 83, "H", "temperature_decidegree"),
     ("status", 90, "I", "status_u32"),
@@ -74,6 +75,8 @@ GETTERS = layouts(
 GAIN_STEPS = 65536
 """Of a velocity gain in one unit; the order of the gains differs between setting and asking."""
 _OLDER_STATUS = struct.Struct(">H")
+# Of each motor the acceleration, then the deceleration, by the vendor's newer library.
+_NEWER_DUTY_ACCELS = struct.Struct(">4xI4xI")
 _GETTER_BY_NUMBER = by_number(GETTERS)
 Value = float | int | str
 
@@ -103,7 +106,8 @@ def with_crc(packet: bytes) -> bytes:
 def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value], int] | None:
     """Return the fields of the reply that `received` begins with and how many bytes it has; None if it is none yet.
 
-    The status word has two bytes on older firmware and four on newer; a version text ends with a line feed and a zero.
+    The status word, of two bytes on older firmware, is returned as the four of newer; a version text ends with a line
+    feed and a zero.
     """
     layout = GETTERS[name]
     head = _head(address, layout.command)
@@ -115,15 +119,27 @@ def reply(address: int, name: str, received: bytes) -> tuple[Mapping[str, Value]
         return MappingProxyType({"version": text}), end + 2 + _CRC_BYTES
     if _checks(head, received, layout.length):
         return MappingProxyType(layout.unpack(received)), layout.length + _CRC_BYTES
+    newer = name == "default_duty_accels"
+    if newer and _checks(head, received, _NEWER_DUTY_ACCELS.size):
+        decels = _NEWER_DUTY_ACCELS.unpack_from(received)
+        return MappingProxyType(dict(zip(layout.fields, decels, strict=True))), _NEWER_DUTY_ACCELS.size + _CRC_BYTES
     older = name == "status" and len(received) == _OLDER_STATUS.size + _CRC_BYTES
     if older and _checks(head, received, _OLDER_STATUS.size):
-        return MappingProxyType({"status_u32": _OLDER_STATUS.unpack_from(received)[0]}), len(received)
+        return MappingProxyType({"status_u32": _in_32_bits(*_OLDER_STATUS.unpack_from(received))}), len(received)
     return None
 
 
 def getter_name(command: int) -> str | None:
     """Name of the command that asks with this number."""
     return _GETTER_BY_NUMBER[command].name if command in _GETTER_BY_NUMBER else None
+
+
+def _in_32_bits(older: int) -> int:
+    """Return an older status of 16 bits as a newer one of 32.
+
+    Lowest are two warnings of current, then the errors, then the other warnings and the home switches.
+    """
+    return (older & 0x3) << 16 | (older & 0x3FC) >> 2 | (older & 0xFC00) << 8
 
 
 def _head(address: int, command: int) -> bytes:
@@ -243,7 +259,7 @@ QUESTIONS = LineQuestions(
 def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
     """Return the motors of the boards that reported their version.
 
-    One board has both sides, of several the first half is left.
+    One board has both sides, of several the first half is left. A board on USB answers to every address.
     """
     version = GETTERS["version"].command
     queries = [(frame.can_id >> 8, frame) for frame in frames if frame.can_id & 0xFF == version and not frame.extended]
@@ -254,6 +270,8 @@ def recognise(frames: Sequence[Frame]) -> dict[str, Any] | None:
             if FIRST_ADDRESS <= address <= LAST_ADDRESS and reply(address, "version", frame.data) is not None
         }
     )
+    if len(boards) == len(QUESTIONS.frames):
+        del boards[1:]
     motors = [f"{address}/{motor}" for address in boards for motor in (1, 2)]
     return {"motors": in_sides(motors)} if motors else None
 
@@ -262,13 +280,13 @@ def stop_frames(settings: RoboclawSettings) -> tuple[Frame, ...]:
     """Zero duty for every board, and the question whether its motors stand; nothing latches it."""
     return (
         *(setting(address, "duty_m1m2", duty_m1=0, duty_m2=0) for address in settings.addresses),
-        *(query(address, "speeds") for address in settings.addresses),
+        *(query(address, "encoders") for address in settings.addresses),
     )
 
 
 def cyclic_frames(settings: RoboclawSettings, command_rate_hz: float, _authenticated: bool) -> tuple[CyclicFrame, ...]:
-    """Return the frames of each period: a command, speeds and counts of each board, and one question more."""
-    each = {"speed command": 16 + 1, "speeds": 2 + 10, "encoders": 2 + 10}
+    """Return the frames of each period: a command and the counts of each board, and one question more."""
+    each = {"speed command": 16 + 1, "encoders": 2 + 10}
     frames = [
         CyclicFrame(f"{name} of {address}", "LINE", length, command_rate_hz, length, _TURNAROUND_S)
         for address in settings.addresses
@@ -296,7 +314,7 @@ def safety_card(settings: RoboclawSettings) -> SafetyCard:
         ),
         setup=(
             "Motion Studio: packet serial at link.baud, each board its own address, encoders and velocity PID tuned "
-            "(QPPS is taken as the fastest speed)",
+            "(QPPS is taken as the fastest speed); Default Accel 655359, with which zero duty is ramped",
         ),
     )
 

@@ -197,6 +197,7 @@ DRIVER = MotorDriver(
     lambda settings, _key: VendorDriver(_Ros2BasePort(settings)),
     settings=wire.Ros2BaseSettings,
     takes_body_speeds=True,
+    largest_difference_rad_s=lambda settings: settings.largest_difference_rad_s,
     example=wire.EXAMPLE,
     stop_frames=lambda settings: _Ros2BasePort(settings).stop_frames(),
     stop_confirmation=lambda settings: stop_confirmation(_Ros2BasePort(settings)),

@@ -198,16 +198,16 @@ class Port(ABC):
         return is_due
 
 
-def stop_confirmation(port: Port) -> Callable[[Frame], bool]:
+def stop_confirmation(port: Port) -> Callable[[ReceivedFrame], bool]:
     """Return what says, frame by frame heard, whether the controllers have confirmed an e-stop that was sent to them.
 
     `port`: a fresh one, for a connection beside the driver's.
     """
     permit = MotionPermit(link_is_up=True, stage=Stage.BRAKING)
 
-    def is_confirmation(frame: Frame) -> bool:
+    def is_confirmation(received: ReceivedFrame) -> bool:
         # Long after any command: none of this connection's can be under way.
-        port.handle(ReceivedFrame(_LONG_AFTER_NS, frame), permit)
+        port.handle(ReceivedFrame(_LONG_AFTER_NS + received.t_ns, received.frame), permit)
         return port.is_stopped
 
     return is_confirmation

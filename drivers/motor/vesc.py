@@ -190,7 +190,7 @@ class _VescPort(Port):
         if not self.is_stopped:
             return Pending(why="a motor is turning; wait until it stands still", is_final=True)
         if any(motor.fault is None for motor in self._all):
-            return Pending(why="a controller does not report whether it has a fault")
+            return Pending(why="a controller does not report whether it has a fault; it needs firmware 5.03 or later")
         return None
 
     def speeds(self, now_ns: int, left_rad_s: float, right_rad_s: float) -> Sequence[Frame]:
@@ -251,9 +251,11 @@ class _VescPort(Port):
     def _missing(self) -> str | None:
         silent = [str(motor.node) for motor in self._all if not motor.answered]
         if silent:
+            # On a serial line a ping is asked as values, which older firmware answers too shortly.
+            is_new = "" if self._settings.uart_node is None else ", and runs firmware 5.03 or later"
             return (
-                f"controller {', '.join(silent)} does not answer; check that it is switched on and has this bit "
-                "rate and this id"
+                f"controller {', '.join(silent)} does not answer; check that it is switched on, has this bit rate and "
+                f"this id{is_new}"
             )
         complete = all(
             m.erpm_ns is not None and m.turned.last is not None and not m.may_report_timeout for m in self._all

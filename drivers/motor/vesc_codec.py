@@ -56,7 +56,10 @@ _VALUES = {
     17: ("controller_id", "B"),
     21: ("status_byte", "B"),
 }
-"""Of COMM_GET_VALUES_SELECTIVE what is asked for: by the bit of its mask the name and the `struct` code."""
+"""Of COMM_GET_VALUES_SELECTIVE what is asked for: by the bit of its mask the name and the `struct` code.
+
+The last one is sent by firmware 5.03 and later; older firmware repeats the mask without it.
+"""
 FAULT_AND_STATUS = 1 << 15 | 1 << 21
 ALL_OF_A_MOTOR = sum(1 << bit for bit in _VALUES)
 # Bits of the status byte.

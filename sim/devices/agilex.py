@@ -21,12 +21,20 @@ TIMEOUT_MS = 500
 STANDBY, CAN_MODE, UART_MODE, RC_MODE = range(4)
 MOTORS = 8
 """Bases with steering have up to eight; those here send the first four."""
-_PERIODS_MS = {0x211: 100, 0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 20, 0x361: 500}
+_PERIODS_MS = {0x221: 20, 0x311: 20, 0x251: 20, 0x261: 100, 0x241: 20, 0x361: 500}
 
 
 @dataclass(slots=True)
 class AgilexBase:
-    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s)."""
+    """State of one base, of which `commanded` is what it follows now: speed (m/s) and turn rate (rad/s).
+
+    It holds either to its own limit, whatever becomes of the curve: `max_speed_m_s` and `max_turn_rad_s`. `state_ms`:
+    period of its state, 200 ms of a BUNKER PRO 2.0.
+    """
+
+    state_ms: int = 100
+    max_speed_m_s: float = math.inf
+    max_turn_rad_s: float = math.inf
 
     vehicle_state: int = 0
     control_mode: int = STANDBY
@@ -67,7 +75,11 @@ class AgilexBase:
             return 0.0, 0.0
         if self._now_ms - self.last_motion_ms > TIMEOUT_MS:
             return 0.0, 0.0
-        return 1e-3 * self.commanded_motion[0], 1e-3 * self.commanded_motion[1]
+        linear, angular = (1e-3 * value for value in self.commanded_motion)
+        return (
+            min(max(linear, -self.max_speed_m_s), self.max_speed_m_s),
+            min(max(angular, -self.max_turn_rad_s), self.max_turn_rad_s),
+        )
 
     def receive(self, frame: CanFrame) -> list[CanFrame]:
         """Take in one frame; return the replies."""
@@ -114,7 +126,7 @@ class AgilexBase:
         """Go through one millisecond; return the messages that are due."""
         self._now_ms = now_ms
         frames = []
-        for can_id, period in _PERIODS_MS.items():
+        for can_id, period in ({0x211: self.state_ms} | _PERIODS_MS).items():
             if now_ms % period == 0:
                 numbers = range(4) if can_id in (0x251, 0x261) else range(1)
                 frames += [self.message(can_id + number) for number in numbers]
@@ -162,7 +174,7 @@ class AgilexController:
         self._settings = settings
         self._ticks_per_rev = ticks_per_rev
         self._ticks = self._zero_ticks = (0, 0)
-        self.base = AgilexBase()
+        self.base = self._create_base()
 
     @property
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
@@ -216,7 +228,10 @@ class AgilexController:
     def restart(self) -> None:
         """Switch off and on: standby, nothing counted."""
         self._zero_ticks = self._ticks
-        self.base = AgilexBase()
+        self.base = self._create_base()
+
+    def _create_base(self) -> AgilexBase:
+        return AgilexBase(max_speed_m_s=self._settings.max_speed_m_s, max_turn_rad_s=self._settings.max_turn_rad_s)
 
 
 CONTROLLER = AgilexController

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 from drivers.motor.odrive_protocol import OdriveSettings
-from drivers.motor.vendor_parts import sides_of
+from drivers.motor.vendor_parts import all_of, sides_of
 from firmware_protocol.firmware_core import FirmwareInputs
 from sim.can_protocol import CanFrame
 from sim.encoder_loop import EncoderLoop, EncoderUse
@@ -338,6 +338,7 @@ class OdriveController:
         self._settings = settings
         self._ticks_per_rev = ticks_per_rev
         self._received_us = 0
+        self._saved = dict.fromkeys(all_of(settings.nodes), (True, settings.watchdog_s, settings.vel_limit_turns_s))
         self.boards = self._create_boards()
         self.axes = self._axes_by_side()
 
@@ -396,8 +397,16 @@ class OdriveController:
                 axis.vel_turns_s = f32(direction * gear * speed / (2.0 * math.pi))
         return [frame for board in self.boards for frame in board.step(now_us // 1000)]
 
+    def save_configuration(self) -> None:
+        """Keep what the axes are set to over a restart; the real board then restarts by itself."""
+        self._saved = {
+            axis.node_id: (axis.watchdog_enabled, axis.watchdog_timeout_s, axis.vel_limit_turns_s)
+            for board in self.boards
+            for axis in board.axes
+        }
+
     def restart(self) -> None:
-        """Switch off and on: nothing is asked, nothing latched, the watchdog as it is set."""
+        """Switch off and on: nothing is asked, nothing latched, and what was set but not saved is lost."""
         self.boards = self._create_boards()
         self.axes = self._axes_by_side()
 
@@ -408,12 +417,13 @@ class OdriveController:
         periods = {"heartbeat": round(1000.0 * settings.heartbeat_s), "encoder": 10}
         boards = [OdriveBoard(settings.firmware, nodes, periods) for nodes in pairs]
         for axis in (axis for board in boards for axis in board.axes):
-            axis.watchdog_enabled, axis.watchdog_timeout_s = True, settings.watchdog_s
-            axis.vel_limit_turns_s = settings.vel_limit_turns_s
+            saved = self._saved[axis.node_id]
+            axis.watchdog_enabled, axis.watchdog_timeout_s, axis.vel_limit_turns_s = saved
         if settings.watchdog_endpoints is not None:
             enabled, timeout = settings.watchdog_endpoints
             for board in boards:
-                board.parameters = {enabled: b"\1\0\0\0", timeout: struct.pack("<f", settings.watchdog_s)}
+                is_on, timeout_s, _ = self._saved[board.axes[0].node_id]
+                board.parameters = {enabled: struct.pack("<?3x", is_on), timeout: struct.pack("<f", timeout_s)}
         return boards
 
     def _axes_by_side(self) -> tuple[list[Axis], list[Axis]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import binascii
 import math
 import struct
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -24,7 +25,11 @@ QUIET_US = 10_000
 
 @dataclass(slots=True)
 class RoboclawRegisters:
-    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32."""
+    """Registers that a host can set and read; motor 1 and 2. Counts wrap at 2^32.
+
+    `estop_lock`: what ends a latched e-stop: 0x55 its release, 0xAA a reset, all else only switching the board off and
+    on, as it comes from the factory.
+    """
 
     timeout_ds: int = 0
     encoder_m1: int = 0
@@ -44,23 +49,27 @@ class RoboclawRegisters:
     temperature_1: int = 300
     temperature_2: int = 300
     status: int = 0
-    estop_lock: int = 0x55
+    estop_lock: int = 0x00
+    duty_accel_m1: int = 655_360
+    duty_accel_m2: int = 655_360
     pid_m1: tuple[int, int, int, int] = (65536, 32768, 0, 100_000)
     pid_m2: tuple[int, int, int, int] = (65536, 32768, 0, 100_000)
     version: str = "USB Roboclaw 2x30a v4.3.6\n"
     nvm_writes: int = 0
     short_status: bool = False
+    has_duty_decel: bool = False
 
 
 class Roboclaw:
-    """One board at `address`.
+    """One board at `address`; on USB it takes each packet for its own, whatever address of 0x80 to 0x87 that has.
 
     `command` is what the motors are to do: "speed" in counts/s (with `accel` in counts/s^2, None for as fast as it
     can), "duty" in 1/32767, or None when nobody has said or the timeout has stopped them.
     """
 
-    def __init__(self, address: int = 0x80) -> None:
+    def __init__(self, address: int = 0x80, *, is_on_usb: bool = False) -> None:
         self.address = address
+        self.is_on_usb = is_on_usb
         self.registers = RoboclawRegisters()
         self.command: tuple[str, float, float] | None = None
         self.accel: float | None = None
@@ -90,7 +99,7 @@ class Roboclaw:
                     # What follows cannot be distinguished from it.
                     self._pending.clear()
                     break
-                if address == self.address:
+                if self._is_meant(address):
                     arguments = struct.unpack(">" + body, packet[2:-2])
                     self._feed(now_us)
                     self.obeyed.append((command, arguments))
@@ -98,7 +107,7 @@ class Roboclaw:
                     out += b"\xff"
             elif command in _GETTERS:
                 del self._pending[:2]
-                if address == self.address:
+                if self._is_meant(address):
                     self._feed(now_us)
                     data = _GETTERS[command](self.registers)
                     out += data + binascii.crc_hqx(bytes((address, command)) + data, 0).to_bytes(2)
@@ -111,6 +120,9 @@ class Roboclaw:
         timeout_us = self.registers.timeout_ds * 100_000
         if timeout_us and now_us - self._fed_us > timeout_us:
             self.command = None
+
+    def _is_meant(self, address: int) -> bool:
+        return 0x80 <= address <= 0x87 if self.is_on_usb else address == self.address
 
     def _feed(self, now_us: int) -> None:
         self.fed += 1
@@ -144,6 +156,8 @@ class Roboclaw:
                 self._drive("speed", a[0], a[1])
             case 40:
                 self._drive("speed", a[1], a[2], a[0])
+            case 68 | 69:
+                setattr(registers, f"duty_accel_m{command - 67}", a[0])
             case 94:
                 registers.nvm_writes += a[0] == 0xE22EAB7A
             case 200 if registers.estop_lock == 0xAA:
@@ -154,13 +168,25 @@ class Roboclaw:
 
 _SETTERS = {
     14: "B", 20: "", 28: "IIII", 29: "IIII", 34: "hh", 35: "i", 36: "i", 37: "ii", 40: "Iii",
-    94: "I", 200: "", 201: "B",
+    68: "I", 69: "I", 94: "I", 200: "", 201: "B",
 }  # fmt: skip
 """By command: how its arguments are packed. Those of a velocity PID are D, P, I, QPPS."""
 
 
 def _counts(*values: int) -> bytes:
     return b"".join((value & 0xFFFF_FFFF).to_bytes(4) for value in values)
+
+
+_SHORT_STATUS = (
+    0x10000, 0x20000, 0x1, 0x2, 0x4, 0x8, 0x10, 0x20, 0x40, 0x80, 0x40000, 0x80000, 0x100000, 0x200000, 0x400000,
+    0x800000,
+)  # fmt: skip
+"""Status of boards with 16 bits, from the lowest on: which bit of the 32 means the same (manuals, command 90)."""
+
+
+def _short_status(status: int) -> int:
+    """Return the status as an older board sends it; what that does not know is left out."""
+    return sum(1 << number for number, bit in enumerate(_SHORT_STATUS) if status & bit)
 
 
 _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
@@ -180,9 +206,12 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
     56: lambda r: _counts(*r.pid_m2),
     78: lambda r: _counts(r.encoder_m1, r.encoder_m2),
     79: lambda r: _counts(r.speed_m1, r.speed_m2),
+    81: lambda r: b"".join(
+        _counts(*(2 if r.has_duty_decel else 1) * (accel,)) for accel in (r.duty_accel_m1, r.duty_accel_m2)
+    ),
     82: lambda r: r.temperature_1.to_bytes(2),
     83: lambda r: r.temperature_2.to_bytes(2),
-    90: lambda r: (r.status & 0xFFFF).to_bytes(2) if r.short_status else r.status.to_bytes(4),
+    90: lambda r: _short_status(r.status).to_bytes(2) if r.short_status else r.status.to_bytes(4),
     202: lambda r: bytes([r.estop_lock]),
 }
 
@@ -190,7 +219,8 @@ _GETTERS: dict[int, Callable[[RoboclawRegisters], bytes]] = {
 class RoboclawController:
     """All boards of a robot on one serial line: satisfies `virtual_robot.Controller`; frames carry the line's bytes.
 
-    Motors whose command has ended, by the serial timeout or an error, coast; zero duty brakes. `dead`: addresses of
+    Motors whose command has ended, by the serial timeout or an error, coast; zero duty brakes, after the ramp of the
+    default duty acceleration. `dead`: addresses of
     boards without supply.
     """
 
@@ -203,6 +233,7 @@ class RoboclawController:
         self._ticks = self._zero_ticks = (0, 0)
         self._measured = (0.0, 0.0)
         self._ramped: dict[tuple[int, int], float] = {}
+        self._counted: tuple[deque[int], deque[int]] = (deque(maxlen=4), deque(maxlen=4))
 
     @property
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
@@ -257,10 +288,12 @@ class RoboclawController:
             ticks = self._ticks[number] - self._zero_ticks[number]
             count = round(direction * ticks * self._counts_per_tick)
             speed = direction * self._measured[number] * self._settings.counts_per_rad
+            self._counted[number].append(count)
             for address, motor in side:
                 registers = self.boards[address].registers
                 setattr(registers, f"encoder_m{motor + 1}", count)
-                setattr(registers, f"speed_m{motor + 1}", round(speed))
+                # In steps of 300 counts/s: what was counted in the last 1/300 s, as long as three steps and a little.
+                setattr(registers, f"speed_m{motor + 1}", 300 * (count - self._counted[number][0]))
                 self._ramp(address, motor, speed)
         for board in self.boards.values():
             if inputs.estop_button:
@@ -285,8 +318,11 @@ class RoboclawController:
         kind, *values = board.command
         target = values[motor]
         if kind == "duty":
-            qpps = (board.registers.pid_m1, board.registers.pid_m2)[motor][3]
-            self._ramped[place] = target / 32767.0 * qpps
+            # By the default duty acceleration, in 1/32767 of full duty a second; a released motor has no duty.
+            accel = (board.registers.duty_accel_m1, board.registers.duty_accel_m2)[motor]
+            per_duty = (board.registers.pid_m1, board.registers.pid_m2)[motor][3] / 32767.0
+            now, step = self._ramped.get(place, 0.0), 1e-3 * accel * per_duty
+            self._ramped[place] = now + min(max(target * per_duty - now, -step), step)
             return
         now = self._ramped.get(place, measured_counts_s)
         step = math.inf if board.accel is None else 1e-3 * board.accel

@@ -243,7 +243,8 @@ class Vesc:
             lambda: b"".join(_steps(each, 10, "h") for each in v.t_mos_c),
             lambda: _steps(v.vd_v, 1000, "i"),
             lambda: _steps(v.vq_v, 1000, "i"),
-            lambda: bytes([status]),
+            # Firmware before 5.03 repeats the mask and does not send it.
+            lambda: bytes([status]) if self.firmware[:2] >= b"\x05\x03" else b"",
         )
         return b"".join(part() for bit, part in enumerate(parts) if mask >> bit & 1)
 

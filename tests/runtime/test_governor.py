@@ -49,6 +49,22 @@ def test_a_late_tick_allows_one_and_a_half_periods_and_time_that_is_none_no_chan
     assert Limited.PERIOD in governed.limited
 
 
+@pytest.mark.parametrize(("left", "right"), [(-4.0, 4.0), (2.0, 8.0), (-7.0, 1.0)])
+def test_wheels_that_may_differ_by_less_are_scaled_by_one_factor(left, right):
+    governor = Governor(replace(LIMITS, max_difference_rad_s=3.0), PERIOD_S)
+    for _ in range(100):
+        governed = governor.step(left, right, PERIOD_S)
+    assert governed.limited == Limited.SPEED
+    assert abs(governed.right_rad_s - governed.left_rad_s) == pytest.approx(3.0)
+    assert governed.left_rad_s * right == pytest.approx(governed.right_rad_s * left)
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0, math.nan])
+def test_a_difference_that_no_wheels_can_have_is_no_limit_of_it(bad):
+    with pytest.raises(ValueError, match="max_difference_rad_s"):
+        replace(LIMITS, max_difference_rad_s=bad)
+
+
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 @pytest.mark.parametrize("field", ["max_speed_rad_s", "max_acceleration_rad_s2", "max_deceleration_rad_s2"])
 def test_limits_cannot_be_switched_off(field, bad):

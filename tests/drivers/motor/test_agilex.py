@@ -4,12 +4,19 @@ import dataclasses
 
 import pytest
 
+from disco_hw.config import load_robot_config
+from disco_hw.estimation.odometry import OdometryParameters
+from disco_hw.runtime.pipeline import Governor, WheelLimits
+from disco_hw.runtime.wheel_faults import WheelFaults
 from drivers.types import DriverState, Request
 from sim.devices.agilex import CAN_MODE, STANDBY
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
+from tests.drivers.motor.test_motor_drivers import robot_toml
 from tests.drivers.motor.vendors import BY_LABEL
 
 AGILEX = BY_LABEL["agilex"]
+SCOUT_TOML = "wheel_radius_m = 0.165\ntrack_m = 0.58\nmax_speed_m_s = 1.5\nmax_turn_rad_s = 0.5235\n"
+SCOUT = dataclasses.replace(AGILEX, changes=SCOUT_TOML)
 
 
 @pytest.fixture
@@ -32,6 +39,21 @@ def test_a_person_who_takes_the_remote_control_drives_and_after_that_it_does_not
     bench.run(1.0, FORWARD)
     assert bench.robot.speed_rad_s == 0.0
     assert base.control_mode == STANDBY
+
+
+def test_a_base_that_sends_its_state_every_200_ms_may_lose_two_of_them_and_is_missed_by_its_motion(bench):
+    bench.robot.controller.base.state_ms = 200
+    bench.drive(0.5, FORWARD)
+    drain, lost = bench.robot.drain, {0x211}
+    bench.robot.drain = lambda: [frame for frame in drain() if frame.can_id not in lost]
+    bench.run(0.4)
+    lost.clear()
+    bench.run(0.5, FORWARD)
+    assert bench.driver.state is DriverState.ARMED
+    lost.add(0x221)
+    bench.run(0.15, FORWARD)
+    assert bench.driver.state is DriverState.FAULT
+    assert "the base's motion stopped reporting" in bench.driver.detail
 
 
 def test_the_buttons_stop_it_and_need_a_reset(bench):
@@ -77,6 +99,33 @@ def test_more_than_the_base_can_do_is_scaled_and_keeps_its_curve(bench):
     left, right = bench.robot.speed
     assert 0.06 * left == pytest.approx(1.5, abs=0.01)
     assert left / right == pytest.approx(2.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("left", "right"), [(-4.0, 4.0), (1.0, 5.0), (-6.0, 2.0)])
+def test_a_turn_faster_than_the_base_can_make_is_scaled_and_keeps_its_curve(left, right):
+    bench = SCOUT.bench().drive(1.0, (left, right))
+    turned = [0.165 * speed for speed in bench.robot.speed]
+    assert turned[1] - turned[0] == pytest.approx(0.58 * 0.5235, abs=0.005)
+    assert turned[0] / turned[1] == pytest.approx(left / right, abs=0.02)
+
+
+def test_wheels_that_turn_as_fast_as_the_base_can_are_no_wheel_fault(tmp_path):
+    """The governor knows the limit of the base, so that what is recorded and expected is what the wheels do."""
+    config = load_robot_config(robot_toml(tmp_path, f'driver = "agilex"\n{SCOUT_TOML}'))
+    limits = WheelLimits(8.0, 20.0, 20.0, max_difference_rad_s=config.largest_wheel_difference_rad_s)
+    governor, faults, bench = Governor(limits, 0.02), WheelFaults(takes_body_speeds=True), SCOUT.bench()
+    bench.arm()
+    geometry, found, seen = OdometryParameters(0.165, 0.58, 0.0), None, 0
+    for _ in range(150):
+        governed = governor.step(-4.0, 4.0, 0.02)
+        bench.run(0.02, (governed.left_rad_s, governed.right_rad_s))
+        samples = [sample for readings in bench.readings[seen:] for sample in readings.wheels]
+        seen = len(bench.readings)
+        found = found or faults.step(bench.now_ns, samples, (), geometry)
+        faults.commanded(bench.now_ns, bench.command)
+    assert found is None
+    assert bench.robot.speed == pytest.approx((governed.left_rad_s, governed.right_rad_s), abs=0.01)
+    assert governed.right_rad_s == pytest.approx(0.5 * 0.5235 * 0.58 / 0.165)
 
 
 @pytest.mark.parametrize("pause_s", [0.55, 2.0])

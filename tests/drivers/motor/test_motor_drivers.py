@@ -71,6 +71,10 @@ def test_a_name_that_no_driver_has_is_refused_with_those_that_there_are(name):
         ('driver = "oddrive"', r"robot\.toml: link\.driver: there is no driver"),
         ("nodes = [3, 5]", r"link\.nodes: belongs to the driver odrive, but link.driver is reference; remove it"),
         (f"{ODRIVE}nodes = [3, 5]", r"watchdog_s: missing; add it"),
+        (
+            f'driver = "agilex"\n{EXAMPLES["agilex"].replace("max_turn_rad_s = 2.5", "")}',
+            r"robot\.toml: \[link\] max_turn_rad_s: missing; add it",
+        ),
         (f"{ODRIVE}nodes = [3, 5]\nwatchdog_s = 0.0", r"link\.watchdog_s"),
         (f"{ODRIVE}nodes = [3, 3]\nwatchdog_s = 0.1", r"link\.nodes: .*twice"),
         (f"{ODRIVE}nodes = [3, 63]\nwatchdog_s = 0.1", r"link\.nodes: .*0 to 62"),

@@ -2,9 +2,11 @@
 
 import itertools
 import struct
+from types import SimpleNamespace
 
 import pytest
 
+from drivers.motor import find_driver
 from drivers.types import DriverState, Request
 from sim.devices.odrive import CLOSED_LOOP, IDLE
 from tests.drivers.motor.bench import FORWARD, IDLE_STATES
@@ -149,3 +151,29 @@ def test_it_does_not_arm_without_encoder_estimates(bench):
     bench.request(Request.ARM).run(0.3)
     assert bench.driver.state in IDLE_STATES
     assert "no encoder estimates" in bench.driver.detail
+
+
+def test_the_lines_of_the_setup_keep_the_watchdog_over_a_power_up(bench):
+    """Each axis begins as the firmware has it, with the watchdog off; then the lines are typed into odrivetool."""
+    controller = bench.robot.controller
+    configs = [SimpleNamespace(enable_watchdog=False, watchdog_timeout=0.0) for _ in axes(bench)]
+
+    def save_configuration():
+        for axis, config in zip(axes(bench), configs, strict=True):
+            axis.watchdog_enabled, axis.watchdog_timeout_s = config.enable_watchdog, config.watchdog_timeout
+        controller.save_configuration()
+
+    for axis in axes(bench):
+        axis.watchdog_enabled, axis.watchdog_timeout_s = False, 0.0
+    controller.save_configuration()
+    for config in configs:
+        typed = SimpleNamespace(config=config, controller=SimpleNamespace(config=SimpleNamespace()))
+        odrv0 = SimpleNamespace(axis0=typed, save_configuration=save_configuration)
+        for line in find_driver("odrive").safety_card(NEW.settings).setup:
+            if line.startswith("odrv0."):
+                exec(line, {"odrv0": odrv0})
+    controller.restart()
+    assert [(axis.watchdog_enabled, axis.watchdog_timeout_s) for axis in axes(bench)] == 2 * [(True, 0.1)]
+    bench.drive(0.5, FORWARD)
+    bench.pause_host(0.5)
+    assert controller.wheels_rad_s == (None, None)

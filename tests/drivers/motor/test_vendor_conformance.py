@@ -265,7 +265,7 @@ def test_an_emergency_stop_from_beside_the_daemon_stops_it_and_is_confirmed(vend
             for frame in found.stop_frames(vendor.settings):
                 bench.robot.receive(bench.now_ns, frame)
         frames = bench.robot.drain()
-        confirmed = confirmed or True in [confirms_stop(frame) for frame in frames]
+        confirmed = confirmed or True in [confirms_stop(ReceivedFrame(bench.now_ns, frame)) for frame in frames]
         for frame in frames:
             bench._send(bench.robot_end, frame)
     assert confirmed

@@ -158,7 +158,8 @@ def test_an_agilexs_state_and_odometry_are_read():
     ],
 )
 def test_an_agilexs_messages_without_a_use_are_known_all_the_same(frame, expected):
-    driver = create_driver("agilex", agilex.AgilexSettings(wheel_radius_m=0.06, track_m=0.31, max_speed_m_s=1.5))
+    measures = {"wheel_radius_m": 0.06, "track_m": 0.31, "max_speed_m_s": 1.5, "max_turn_rad_s": 2.5}
+    driver = create_driver("agilex", agilex.AgilexSettings(**measures))
     driver.link_up(0)
     driver.receive(0, [ReceivedFrame(0, frame)])
     assert getattr(driver.stats, expected) == 1
@@ -245,6 +246,6 @@ def test_a_roboclaws_value_is_held_to_what_the_wire_can_say():
 
 def test_a_roboclaws_answer_is_read_with_its_sign_and_its_status_may_have_two_bytes():
     assert roboclaw.reply(0x80, "encoders", ENCODERS) == ({"encoder_m1": 1, "encoder_m2": -1}, 10)
-    for status, length in ((b"\x40\x01", 4), (b"\0\0\x40\x01", 6)):
+    for status, length, meant in ((b"\x01\x05", 4, 0x10041), (b"\0\0\x40\x01", 6, 0x4001)):
         received = roboclaw.with_crc(b"\x80\x5a" + status)[2:]
-        assert roboclaw.reply(0x80, "status", received) == ({"status_u32": 0x4001}, length)
+        assert roboclaw.reply(0x80, "status", received) == ({"status_u32": meant}, length)

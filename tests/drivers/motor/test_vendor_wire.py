@@ -22,8 +22,8 @@ SUMS = {
     "vesc-four-braking": "abb1d5 22f891 0d471e 557862 5c4d8f 91bd08 ca59f9 aad34b 9972fe 13e3a5",
     "vesc-uart": "5ccdae 20cbc8 ee78c3 73172c 060d59 9abb33 628638 8b6f63 f5e4b9 07af09",
     "agilex": "e3b0c4 2d8bed 25fe17 bf6f49 350532 9a3dd8 c7c7a0 6a8174 53ecac e3b0c4",
-    "roboclaw": "6e0c07 cfe96a 90c18e be1b94 944ebe f2ac0d 7ac8c9 94f426 c6c7d4 fb0445",
-    "roboclaw-a-board-a-side": "a0866e 68a16a 241b5a bd0254 e0ba41 d2280f f93b2b 0cbba8 be8730 92b359",
+    "roboclaw": "e5b47b 7161c0 2a3576 22bd85 2c8122 cc06d6 98dc6b 6b454a c5f6d1 278519",
+    "roboclaw-a-board-a-side": "9a3d01 c2a2dc f76b7e 6f994d 760e80 45cd67 e4557a c21981 de63e2 4d85fd",
     "ros2-base": "e3b0c4 1450c4 22d636 e0adb8 255f60 81ad5e e3b0c4 186d20 3f0143 272f2d",
 }
 """SHA-256 of the frames of each phase of `scripted_day`, in its order: the first six digits."""

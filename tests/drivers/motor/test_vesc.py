@@ -124,3 +124,15 @@ def test_a_fault_is_named_within_half_a_second_and_the_questions_for_it_do_not_f
 def test_the_emergency_stop_is_one_frame_to_all():
     (frame,) = find_driver("vesc").stop_frames(VESC.settings)
     assert (frame.can_id, frame.extended, frame.data.hex()) == (0x2FF, True, "00004e20")
+
+
+@pytest.mark.parametrize("label", ["vesc", "vesc-uart"])
+@pytest.mark.parametrize(("version", "is_driven"), [(b"\x05\x02", False), (b"\x05\x03", True)])
+def test_firmware_that_is_too_old_is_named_as_what_to_change(label, version, is_driven):
+    bench = BY_LABEL[label].bench()
+    for side in bench.robot.controller.sides:
+        side[0].firmware = version + side[0].firmware[2:]
+    bench.run(0.5)
+    bench.request(Request.ARM).run(2.0, FORWARD)
+    assert (bench.driver.state is DriverState.ARMED) is is_driven
+    assert ("firmware 5.03 or later" in bench.driver.detail) is not is_driven

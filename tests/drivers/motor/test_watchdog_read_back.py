@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from disco_hw.runtime.preflight import Level, check_watchdog
+from drivers.motor import find_driver
 from drivers.motor.vesc_codec import timeout
 from drivers.types import DriverState
 from tests.drivers.motor.bench import IDLE_STATES
@@ -33,7 +34,11 @@ def set_odrive(number, value):
         (VESC, set_vesc("timeout_ms", 0), "controller 51: its timeout is off"),
         (VESC, set_vesc("timeout_ms", 1000), "controller 51: its timeout is 1 s; set 0.1 s there"),
         (VESC, set_vesc("timeout_brake_current_a", 30.0), "brakes with 30 A"),
-        (ODRIVE, set_odrive(220, bytes(4)), "node 5: its watchdog is off"),
+        (
+            ODRIVE,
+            set_odrive(220, bytes(4)),
+            "node 5: its watchdog is off; set axis0.config.enable_watchdog and call odrv0.save_configuration()",
+        ),
         (ODRIVE, set_odrive(221, struct.pack("<f", 2.0)), "node 5: its watchdog is set to 2 s; set it to 0.1 s"),
         (
             ODRIVE,
@@ -50,6 +55,13 @@ def test_a_controller_whose_watchdog_is_another_or_not_where_it_should_be_is_ref
     assert expected_detail in bench.driver.detail
     assert bench.driver.identity is bench.driver.limits is None
     assert not [frame for frame in bench.robot.received if vendor.is_motion(frame)]
+
+
+def test_the_safety_card_says_that_the_watchdog_was_not_read_back_only_where_it_is_not():
+    declared, read_back = (find_driver("odrive").safety_card(one.settings) for one in (BY_LABEL["odrive-0.6"], ODRIVE))
+    assert "watchdog (0.1 s), velocity limit and heartbeat" in " ".join(declared.unverified)
+    assert "watchdog (" not in " ".join(read_back.unverified)
+    assert "velocity limit and heartbeat period are declared" in " ".join(read_back.unverified)
 
 
 def test_a_vesc_that_does_not_answer_is_driven_as_declared_and_said_to_be():

@@ -130,7 +130,7 @@ def is_roboclaw_forbidden(frame):
     command = frame.can_id & 0xFF
     if command == 34:
         return any(frame.data[2:6])
-    return command not in (14, 15, 21, 40, 55, 56, 78, 79, 90, 200)
+    return command not in (14, 15, 21, 40, 55, 56, 78, 81, 90, 200)
 
 
 def set_ros2_base_odometry(is_sent):
