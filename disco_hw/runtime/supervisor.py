@@ -60,6 +60,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the task is left to
     drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
     being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
+    `pose_refusal`: why poses that come are refused, in words, else empty.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
     in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty. `fence_fault`:
     why the fence lets no task go on, else empty.
@@ -78,6 +79,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     task_finished: bool = False
     recording_fault: str = ""
     heading_missing: bool = False
+    pose_refusal: str = ""
     by_hand: bool = False
     poses_contradict: str = ""
     pose_jump: str = ""
@@ -269,7 +271,7 @@ class Supervisor:
         if self._settings.heading_required and inputs.heading_missing:
             return f"heading not known; {FIND_HEADING}"
         if self._settings.pose_required and not inputs.pose_ok:
-            return "no valid pose; check the pose sensor, or set estimation.pose_required = false"
+            return f"no valid pose; {inputs.pose_refusal or 'check the pose sensor'}"
         return inputs.fence_fault or None
 
     def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:

@@ -28,7 +28,8 @@ def refusal(out):
 # --- one test per row of the table -----------------------------------------------------------------------------------
 
 STARTS = ["ready", "armed", "running", "stopping"]
-NO_POSE = "no valid pose; check the pose sensor, or set estimation.pose_required = false"
+NO_POSE = "no valid pose; check the pose sensor"
+REFUSED = "udp: poses at (500000, 0) m are over 1000 m from the origin; set pose.origin"
 UNKNOWN_HEADING = (
     "heading not known; the pose sensor measures none: drive one metre straight ahead by hand, on the page, to find it"
 )
@@ -213,11 +214,12 @@ def test_stopping_lasts_until_the_robot_is_disarmed_and_the_wheels_are_still():
     ("pose_required", "lost", "found", "reason"),
     [
         (True, {"pose_ok": False}, {"pose_ok": True}, NO_POSE),
+        (True, {"pose_ok": False, "pose_refusal": REFUSED}, {"pose_ok": True}, f"no valid pose; {REFUSED}"),
         (True, {"heading_missing": True}, {"heading_missing": False}, UNKNOWN_HEADING),
         (False, {"heading_missing": True}, {"heading_missing": False}, UNKNOWN_HEADING),
         (True, {"pose_jump": JUMP}, {"pose_jump": ""}, AFTER_JUMP),
     ],
-    ids=["pose", "heading", "heading-no-pose-required", "jump"],
+    ids=["pose", "refused", "heading", "heading-no-pose-required", "jump"],
 )
 def test_without_a_reliable_pose_a_task_stops_for_good_and_none_is_started(pose_required, lost, found, reason):
     bench = Bench(replace(SETTINGS, pose_required=pose_required)).running()
