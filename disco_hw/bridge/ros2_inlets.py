@@ -48,7 +48,7 @@ class PoseInlet:
         self.passed = 0
         self.why = ""
         self._publishers = SenderGate(silence_s)
-        self._settings = settings
+        self._settings = settings.in_source_units()
         self._newest_ns = self._passed_ns = -OLDEST_NS
 
     def datagram(
@@ -138,7 +138,7 @@ class TransformInlet:
         self.refused: Counter[str] = Counter()
         self._silence_s = silence_s
         self._publishers: dict[str, SenderGate] = {}
-        self._settings = settings
+        self._settings = settings.in_source_units()
         self._map, self._base = _frame(settings.frame), _frame(base_frame)
         self._edges: dict[str, _Followed] = {}
         self._chain: tuple[Edge, ...] | None = None

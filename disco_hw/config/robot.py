@@ -154,6 +154,11 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         """Return the units and axes in which the source reports poses."""
         return msgspec.convert(self, PoseConvention, from_attributes=True)
 
+    def in_source_units(self) -> PoseInput:
+        """Return the settings as the source takes them: their standard deviations join its poses, in its units."""
+        position_std, yaw_std = self.convention().to_source_units(self.position_std_m, self.yaw_std_rad)
+        return msgspec.structs.replace(self, position_std_m=position_std, yaw_std_rad=yaw_std)
+
 
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The loop and the planner."""

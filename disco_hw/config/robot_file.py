@@ -215,7 +215,7 @@ def _check(path: Path, config: RobotConfig) -> None:
             _check_values(path, name, getattr(config, name))
     for number, one in enumerate(config.pose.also):
         _check_values(path, f"pose.also[{number}]", one)
-    _check_allowed_senders(path, config.pose)
+    _check_pose(path, config.pose, config.estimation.history_s)
     for field in config.prior.__struct_fields__:
         low, high = getattr(config.prior, field)
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
@@ -253,14 +253,18 @@ def _check(path: Path, config: RobotConfig) -> None:
         _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
 
 
-def _check_allowed_senders(path: Path, pose: PoseInput) -> None:
-    """Refuse an `allow` that is no list of addresses and networks."""
+def _check_pose(path: Path, pose: PoseInput, history_s: float) -> None:
+    """Refuse an `allow` that is no list of addresses and networks, and poses that would always be too old."""
     for number, one in enumerate(pose.every()):
+        where = "pose" if number == 0 else f"pose.also[{number - 1}]"
         try:
             parse_allowed(("127.0.0.1",) if one.allow is None else one.allow)
         except ValueError as error:
-            field = "pose.allow" if number == 0 else f"pose.also[{number - 1}].allow"
-            _refuse(path, field, str(error), 'write addresses as "192.168.1.20" or networks as "192.168.1.0/24"')
+            hint = 'write addresses as "192.168.1.20" or networks as "192.168.1.0/24"'
+            _refuse(path, f"{where}.allow", str(error), hint)
+        if one.latency_s >= history_s:
+            fault = f"poses that are {one.latency_s:g} s old are refused, as estimation.history_s is {history_s:g}"
+            _refuse(path, f"{where}.latency_s", fault, "raise estimation.history_s above it")
 
 
 def _check_task(path: Path, config: RobotConfig) -> None:

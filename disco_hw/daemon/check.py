@@ -12,6 +12,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import msgspec
+
 from disco_hw.adaptation.guard import choose_adaptation
 from disco_hw.config import PoseInput, RobotConfig
 from disco_hw.daemon import send_request, socket_path
@@ -19,8 +21,9 @@ from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.pose_sources import APART_STDS
 from disco_hw.processes import can_lock_memory, can_use_fifo
 from disco_hw.runtime import connection
-from disco_hw.runtime.assembly import create_link, driver_of, pose_source_of
+from disco_hw.runtime.assembly import create_link, create_pipeline, driver_of, pose_source_of
 from disco_hw.runtime.obstacles import obstacle_source_of
+from disco_hw.runtime.pipeline import NoPlanner, Off, Pipeline
 from disco_hw.runtime.preflight import (
     Check,
     Level,
@@ -114,7 +117,8 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
         checks.append(_link_check(transport))
         if checks[-1].level is Level.OK:
             refuse_other_host(transport, driver_of(setup.config, key))
-            found = _query_robot(transport, driver_of(setup.config, key), pose_source)
+            pipeline = create_pipeline(setup.config, setup.model, NoPlanner())
+            found = _query_robot(transport, driver_of(setup.config, key), pose_source, pipeline)
             checks.append(_firmware_check(found, kind.reports_reception))
             if kind.reports_reception:
                 checks.append(_hearing_check(found))
@@ -136,13 +140,17 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """Replies of the robot during a check; `pose_message` is the pose source's newest message, or empty."""
+    """Replies of the robot during a check; `pose_message` is the pose source's newest message, or empty.
+
+    `pose_refusal`: why all poses of a source were refused, in words, or empty.
+    """
 
     driver: Driver
     detail: str
     wheels: tuple[WheelSample, ...]
     poses: tuple[PoseSample, ...]
     pose_message: str
+    pose_refusal: str
     rejected: int
     reported: tuple[RobotStatus, ...]
     round_trips_s: tuple[float, ...]
@@ -225,8 +233,11 @@ def _link_check(transport: Transport) -> Check:
     return Check("link", Level.OK, transport.name)
 
 
-def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) -> _Found:
-    """Shake hands, listen for three seconds and time the answers to the driver's own clock requests."""
+def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource, pipeline: Pipeline) -> _Found:
+    """Shake hands, listen for three seconds and time the answers to the driver's own clock requests.
+
+    `pipeline` takes in wheels and poses as while driving.
+    """
     stopwatch = _Stopwatch()
     wheels: list[WheelSample] = []
     poses: list[PoseSample] = []
@@ -244,6 +255,7 @@ def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) 
         wheels += readings.wheels
         came = pose_source.receive(now_ns, readings.poses)
         poses += came
+        pipeline.step(now_ns, pipeline.screen(msgspec.structs.replace(readings, poses=tuple(came))), Off())
         if isinstance(pose_source, MessageSource):
             pose_message = next(reversed(pose_source.new_messages()), pose_message)
         reported += [status for status in readings.status if status.t_ns - start_ns > _SETTLED_S * 1e9]
@@ -252,12 +264,14 @@ def _query_robot(transport: Transport, driver: Driver, pose_source: PoseSource) 
                 stopwatch.sent(outgoing)
         time.sleep(_STEP_S)
     stats = driver.stats
+    refusals = [one.refusal for one in pipeline.fusion.sources.all if one.refusal and not one.accepted]
     return _Found(
         driver=driver,
         detail=connection(transport.state, transport.last_error, driver.state, driver.detail),
         wheels=tuple(wheels),
         poses=tuple(poses),
         pose_message=pose_message,
+        pose_refusal="; ".join(refusals),
         rejected=stats.rejected_crc + stats.rejected_sequence + stats.rejected_length + transport.stats.malformed,
         reported=tuple(reported),
         round_trips_s=tuple(stopwatch.round_trips_s),
@@ -365,7 +379,7 @@ def _hearing_check(found: _Found) -> Check:
 
 
 def _telemetry_check(found: _Found) -> Check:
-    """Fail without wheel samples; warn without poses or heading, or if frames were rejected."""
+    """Fail without wheel samples or if poses are refused; warn without poses or heading, or if frames were rejected."""
     name = "telemetry"
     rates = f"{len(found.wheels) / _LISTEN_S:.0f} wheel and {len(found.poses) / _LISTEN_S:.0f} pose samples a second"
     if not found.wheels:
@@ -377,6 +391,8 @@ def _telemetry_check(found: _Found) -> Check:
             Level.WARNING,
             f"{rates}{why}; without a pose the task does not start while estimation.pose_required is true",
         )
+    if found.pose_refusal:
+        return Check(name, Level.FAIL, f"{rates}; {found.pose_refusal}")
     if not any(pose.has_heading for pose in found.poses):
         return Check(name, Level.WARNING, f"{rates}; heading not known; {FIND_HEADING}")
     if found.rejected:

@@ -122,7 +122,7 @@ class PoseFusion:
         sources: Sequence[str] = ("poses",),
     ) -> None:
         self._settings = settings
-        self.sources = PoseSources(sources, settings.pose_timeout_s)
+        self.sources = PoseSources(sources, settings.pose_timeout_s, settings.history_s)
         self._filter = PoseFilter(settings, parameters)
         self._history_s = settings.history_s
         self._pose_timeout_s = settings.pose_timeout_s

@@ -66,6 +66,11 @@ class HeadingWatch:
         """State of the headings of each source."""
         return tuple(one.current for one in self._sources)
 
+    @property
+    def measures_none(self) -> bool:
+        """Whether the newest poses have no heading that is a measurement, of whichever source; False before any."""
+        return {Heading.NONE, Heading.FROZEN} >= set(self.current) - {Heading.WAITING} != set()
+
     def screen(self, sample: PoseSample, difference_rad: float, turn_per_rad: float) -> tuple[PoseSample, bool]:
         """Return the pose, without its heading where that is no measurement.
 

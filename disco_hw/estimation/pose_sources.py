@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
-from disco_hw.estimation.correction import PoseReason, PoseUpdate, Triple
+from disco_hw.estimation.correction import MAX_POSITION_M, PoseReason, PoseUpdate, Triple
 from drivers.types import PoseSample
 
 MAX_POSE_RATE_HZ = 100.0
@@ -59,7 +59,9 @@ class TrackedSource:
     accepted: int = 0
     outliers: int = 0
     refused: int = 0
-    is_thinned: bool = False
+    refusal: str = ""
+    """Why its newest pose was refused, in words; empty if it was not, or for no reason that lasts."""
+    reported: set[PoseReason] = field(default_factory=set)
     in_a_row: int = 0
     """Accepted poses since the last that was not; of gated ones the negative."""
     left_by_jump: bool = False
@@ -112,11 +114,12 @@ class TrackedSource:
 class PoseSources:
     """Follows the sources of one estimate; pure, and the same calls give the same verdicts."""
 
-    def __init__(self, labels: Sequence[str], timeout_s: float) -> None:
+    def __init__(self, labels: Sequence[str], timeout_s: float, history_s: float) -> None:
         self.all = tuple(TrackedSource(label) for label in labels)
         self.contradiction = ""
         """Which two contradict each other, in words, while the estimate must not be driven by; else empty."""
         self._timeout_ns = round(timeout_s * 1e9)
+        self._history_s = history_s
         self._messages: list[str] = []
 
     def add_sample(self, sample: PoseSample, update: PoseUpdate, now_ns: int) -> None:
@@ -133,11 +136,11 @@ class PoseSources:
             for one in self.all:
                 one.reset_course()
         source.add_evaluation(update.reason, update.innovation, update.innovation_variance)
-        if update.reason is PoseReason.OVERFLOW and not source.is_thinned:
-            source.is_thinned = True
-            self._messages.append(
-                f"{source.label}: more than {MAX_POSE_RATE_HZ:.0f} poses a second; the rest is left out"
-            )
+        text = _describe_refusal(sample, update, self._history_s)
+        source.refusal = text and f"{source.label}: {text}"
+        if source.refusal and update.reason not in source.reported:
+            source.reported.add(update.reason)
+            self._messages.append(source.refusal)
         if update.accepted:
             source.good_ns = max(sample.t_ns, source.good_ns or sample.t_ns)
 
@@ -158,6 +161,11 @@ class PoseSources:
         """Sentences for the operator since the last call."""
         messages, self._messages = self._messages, []
         return messages
+
+    @property
+    def refusal(self) -> str:
+        """Why the newest pose of a source was refused, in words; empty if none was, or for no reason that lasts."""
+        return next((one.refusal for one in self.all if one.refusal), "")
 
     def is_good(self, number: int) -> bool:
         """Whether poses of this source are believed; of a single one they always are."""
@@ -226,6 +234,27 @@ class PoseSources:
             if difference:
                 return f"{one.label} and {other.label} disagree: {difference} more than their stated noise"
         return ""
+
+
+def _describe_refusal(sample: PoseSample, update: PoseUpdate, history_s: float) -> str:
+    """Return what is wrong with a pose and what to do; empty if it was used, or refused for no reason that lasts."""
+    match update.reason:
+        case PoseReason.NOT_FINITE:
+            return "poses hold what is not a number; check the pose sensor"
+        case PoseReason.OUT_OF_RANGE if max(abs(sample.x_m), abs(sample.y_m)) > MAX_POSITION_M:
+            place = f"({sample.x_m:.0f}, {sample.y_m:.0f}) m"
+            return f"poses at {place} are over {MAX_POSITION_M:.0f} m from the origin; set pose.origin"
+        case PoseReason.OUT_OF_RANGE:
+            return "poses have an impossible heading or offset; check the pose sensor and pose.offset"
+        case PoseReason.FUTURE:
+            return f"poses are stamped {-update.age_s:.2f} s in the future; correct the clock of the pose sensor"
+        # Younger ones are from before the first wheel sample.
+        case PoseReason.TOO_OLD if update.age_s > history_s:
+            age = f"{update.age_s:.1f} s old, over estimation.history_s = {history_s:g}"
+            return f"poses are {age}; raise it, or correct the clock of the pose sensor"
+        case PoseReason.OVERFLOW:
+            return f"more than {MAX_POSE_RATE_HZ:.0f} poses a second; the rest is left out"
+    return ""
 
 
 def _difference(one: TrackedSource, other: TrackedSource) -> str:

@@ -214,7 +214,7 @@ def pose_source_of(config: RobotConfig) -> PoseSource:
     for label, named in zip(config.pose.labels(), config.pose.every(), strict=True):
         try:
             source = create_pose_source(
-                **msgspec.structs.asdict(named), key=_pose_key(named), sender_silence_s=silence_s
+                **msgspec.structs.asdict(named.in_source_units()), key=_pose_key(named), sender_silence_s=silence_s
             )
         except (InputError, KeyFileError, PoseSourceError) as error:
             for one in opened:

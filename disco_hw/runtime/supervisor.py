@@ -59,7 +59,9 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors`
     are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the task is left to
     drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
-    being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known.
+    being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known;
+    `measures_no_heading`: because they have no heading.
+    `pose_refusal`: why poses that come are refused, in words, else empty.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
     in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty. `fence_fault`:
     why the fence lets no task go on, else empty.
@@ -78,6 +80,8 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     task_finished: bool = False
     recording_fault: str = ""
     heading_missing: bool = False
+    measures_no_heading: bool = False
+    pose_refusal: str = ""
     by_hand: bool = False
     poses_contradict: str = ""
     pose_jump: str = ""
@@ -267,9 +271,9 @@ class Supervisor:
         if inputs.poses_contradict and self._settings.heading_required:
             return f"{inputs.poses_contradict}; find the source that is wrong and remove it from [pose] in robot.toml"
         if self._settings.heading_required and inputs.heading_missing:
-            return f"heading not known; {FIND_HEADING}"
+            return _heading_fault(inputs)
         if self._settings.pose_required and not inputs.pose_ok:
-            return "no valid pose; check the pose sensor, or set estimation.pose_required = false"
+            return f"no valid pose; {inputs.pose_refusal or 'check the pose sensor'}"
         return inputs.fence_fault or None
 
     def _why_not_reset(self, inputs: Inputs, seen: int) -> str | None:
@@ -376,7 +380,7 @@ class Supervisor:
         match self._state:
             case State.READY:
                 if self._arming is None and self._settings.heading_required and inputs.heading_missing:
-                    return f"heading not known; {FIND_HEADING}"
+                    return _heading_fault(inputs)
                 return ARMING if self._arming is not None else "ready to be armed"
             case State.ARMED if not seen & C.TELEMETRY_FRESH:
                 return "no recent wheel data from the robot: commanding zero speed"
@@ -418,6 +422,13 @@ class Supervisor:
         if self._state is State.FAULT and self._resetting is not None and seen & _ROBOT_HAS_FAULT:
             return _first_request(self._resetting, Request.RESET)
         return Request.STANDBY
+
+
+def _heading_fault(inputs: Inputs) -> str:
+    """Return how the heading that is missing is found: by driving, or by poses that fail to come."""
+    if inputs.measures_no_heading:
+        return f"heading not known; {FIND_HEADING}"
+    return "heading too uncertain; wait for poses with a heading, then start again"
 
 
 def _reason(row: Transition, inputs: Inputs) -> str:

@@ -112,6 +112,29 @@ class Wiring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     encoder_direction: tuple[_Sign, _Sign] = (1, 1)
     turn_ratio: Annotated[float, Meta(ge=0.01, le=100.0)] = 1.0
 
+    def to_controller(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
+        """Return the speeds to command of the controller's two sides for these true speeds of the wheels."""
+        left, right = self.motor_direction[0] * left_rad_s, self.motor_direction[1] * right_rad_s
+        if self.sides_swapped:
+            left, right = right, left
+        return left / self.turn_ratio, right / self.turn_ratio
+
+    def from_controller(self, left_rad_s: float, right_rad_s: float) -> tuple[float, float]:
+        """Return the true speeds of the wheels for which the controller's two sides are commanded these."""
+        left, right = (right_rad_s, left_rad_s) if self.sides_swapped else (left_rad_s, right_rad_s)
+        return self.motor_direction[0] * left * self.turn_ratio, self.motor_direction[1] * right * self.turn_ratio
+
+    def true_wheels(self, sample: WheelSample) -> WheelSample:
+        """Return the controller's sample for the true wheels."""
+        angles = [sample.left_angle_rad, sample.right_angle_rad]
+        speeds = [sample.left_speed_rad_s, sample.right_speed_rad_s]
+        if self.sides_swapped != self.encoders_swapped:
+            angles.reverse()
+            speeds.reverse()
+        left, right = (self.turn_ratio * direction for direction in self.encoder_direction)
+        turned = (left * angles[0], right * angles[1], left * speeds[0], right * speeds[1])
+        return WheelSample(sample.t_ns, sample.received_ns, *turned)
+
 
 AS_CONFIGURED = Wiring()
 # Limits of a controller that count its own turns; `ticks_per_rev` is of the controller on both sides.
@@ -193,32 +216,16 @@ class RewiredDriver:
         readings = self._driver.receive(now_ns, frames)
         return msgspec.structs.replace(
             readings,
-            wheels=tuple(self._wheels(sample) for sample in readings.wheels),
+            wheels=tuple(self._wiring.true_wheels(sample) for sample in readings.wheels),
             motors=tuple(self._motors(sample) for sample in readings.motors),
         )
 
     def transmit(self, now_ns: int, command: WheelCommand | None) -> tuple[OutgoingFrame, ...]:
         """Frames due now, with the command for the sides as they are wired."""
-        return self._driver.transmit(now_ns, None if command is None else self._command(command))
-
-    def _command(self, command: WheelCommand) -> WheelCommand:
-        wiring = self._wiring
-        left = wiring.motor_direction[0] * command.left_rad_s / wiring.turn_ratio
-        right = wiring.motor_direction[1] * command.right_rad_s / wiring.turn_ratio
-        if wiring.sides_swapped:
-            left, right = right, left
-        return WheelCommand(left, right, command.valid_for_s)
-
-    def _wheels(self, sample: WheelSample) -> WheelSample:
-        wiring = self._wiring
-        angles = [sample.left_angle_rad, sample.right_angle_rad]
-        speeds = [sample.left_speed_rad_s, sample.right_speed_rad_s]
-        if wiring.sides_swapped != wiring.encoders_swapped:
-            angles.reverse()
-            speeds.reverse()
-        left, right = (wiring.turn_ratio * direction for direction in wiring.encoder_direction)
-        turned = (left * angles[0], right * angles[1], left * speeds[0], right * speeds[1])
-        return WheelSample(sample.t_ns, sample.received_ns, *turned)
+        if command is not None:
+            sides = self._wiring.to_controller(command.left_rad_s, command.right_rad_s)
+            command = WheelCommand(*sides, command.valid_for_s)
+        return self._driver.transmit(now_ns, command)
 
     def _motors(self, sample: MotorSample) -> MotorSample:
         if not self._wiring.sides_swapped:

@@ -78,6 +78,10 @@ class PoseConvention(msgspec.Struct, frozen=True):
     offset: tuple[float, float] = (0.0, 0.0)
     latency_s: float = 0.0
 
+    def to_source_units(self, position_std_m: float, yaw_std_rad: float) -> tuple[float, float]:
+        """Return standard deviations in the units of the source, for a source that takes its own from robot.toml."""
+        return position_std_m / _METRES[self.position_unit], yaw_std_rad / _RADIANS[self.yaw_unit]
+
     def converted(self, sample: PoseSample) -> PoseSample:
         """Return the pose of the tracked point in metres and radians, counter-clockwise, yaw in (-pi, pi].
 

@@ -60,6 +60,17 @@ def test_a_pose_reaches_the_daemon_at_its_own_time(kind):
     assert (pose.position_std_m, pose.yaw_std_rad) == (0.03, 0.04)
 
 
+def test_deviations_of_robot_toml_are_metres_and_radians_whatever_the_units_of_the_poses():
+    settings = PoseInput(position_unit="mm", yaw_unit="deg", position_std_m=0.03, yaw_std_rad=0.04)
+    pose = pose_of(PoseInlet(settings).datagram(pose_message(), 0, MONO_NS, WALL_NS), MONO_NS)
+    found = settings.convention().converted(pose)
+    assert (found.position_std_m, found.yaw_std_rad) == pytest.approx((0.03, 0.04))
+    inlet = TransformInlet(settings, "base_link")
+    (message,) = inlet.poses(transform("map", "base_link", WALL_NS, 1.0), 0, WALL_NS, static=False)
+    assert message.pose.covariance[0] == pytest.approx(30.0**2)
+    assert message.pose.covariance[35] == pytest.approx(math.degrees(0.04) ** 2)
+
+
 def test_a_covariance_becomes_standard_deviations_the_larger_of_the_position(poses):
     message = pose_message(kind=msg.Odometry, covariance=covariance(0.01, 0.04, 0.0009))
     pose = pose_of(poses.datagram(message, 0, MONO_NS, WALL_NS), MONO_NS)

@@ -12,7 +12,9 @@ import pytest
 
 from disco_hw.daemon import check, run
 from disco_hw.errors import InputError, WorkError
+from disco_hw.runtime.assembly import create_pipeline
 from disco_hw.runtime.core import TaskPilot
+from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.preflight import Level
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.motor import create_driver
@@ -64,7 +66,9 @@ def brief(monkeypatch):
 
 def query(robot, key=b"", poses=None):
     """Ask a robot with the host's key for all that a check needs."""
-    return check._query_robot(robot, create_driver(None, None, key or None), poses or RobotPoses())
+    setup = load_setup(ROBOT_FILE)
+    pipeline = create_pipeline(setup.config, setup.model, NoPlanner())
+    return check._query_robot(robot, create_driver(None, None, key or None), poses or RobotPoses(), pipeline)
 
 
 @pytest.mark.parametrize(
@@ -138,6 +142,34 @@ def test_what_the_wheels_do_is_heard_while_the_check_listens():
     robot = RobotInTime(b"")
     robot.robot.pushed = 2.0
     assert check._wheels_check(query(robot).wheels).text.count("at most at +2.00 rad/s") == 2
+
+
+class Mocap:
+    """A motion capture at 50 Hz that is this far away, and whose poses are this old."""
+
+    def __init__(self, x_m, age_s):
+        self.x_m, self.age_ns, self._next_ns = x_m, round(1e9 * age_s), 0
+
+    def receive(self, now_ns, from_robot):
+        if now_ns < self._next_ns:
+            return []
+        self._next_ns = now_ns + 20 * MS_NS
+        return [PoseSample(now_ns - self.age_ns, now_ns, self.x_m, 2.0, 0.1, 0.01, 0.02)]
+
+
+@pytest.mark.parametrize(
+    ("x_m", "age_s", "level", "expected_text"),
+    [
+        (1.0, 0.1, Level.OK, "none rejected"),
+        (5e5, 0.1, Level.FAIL, "robot: poses at (500000, 2) m are over 1000 m from the origin; set pose.origin"),
+        (1.0, 1.3, Level.FAIL, "robot: poses are 1.3 s old, over estimation.history_s = 1; raise it"),
+    ],
+    ids=["used", "far", "old"],
+)
+def test_poses_that_the_filter_refuses_fail_with_the_reason(x_m, age_s, level, expected_text):
+    reported = check._telemetry_check(query(RobotInTime(b""), poses=Mocap(x_m, age_s)))
+    assert reported.level is level
+    assert expected_text in reported.text
 
 
 def test_the_conformance_suite_keeps_out_of_a_daemons_way_too(tmp_path):

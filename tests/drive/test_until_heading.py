@@ -38,6 +38,14 @@ class WithoutHeading:
         pass
 
 
+class OneRoughHeading(WithoutHeading):
+    """One pose with a heading that is good to a radian, and no more."""
+
+    def receive(self, now_ns, from_robot):
+        self.count += len(from_robot)
+        return [msgspec.structs.replace(pose, yaw_std_rad=1.0) for pose in from_robot if self.count == 1]
+
+
 @pytest.fixture
 def bench():
     stack = simulated_stack(NoPlanner())
@@ -81,6 +89,13 @@ def test_by_hand_a_metre_and_then_the_task_is_armed_anew(bench):
     assert all(reply.accepted for reply in replies(started))
     assert started[-1].output.motion_allowed
     assert any(tick.output.running for tick in started)
+
+
+def test_nobody_is_asked_to_find_a_heading_that_the_source_measures(bench):
+    bench.core.pose_source = OneRoughHeading()
+    last = bench.run(1.0)[-1]
+    assert last.pipeline.estimate.initialised
+    assert "heading too uncertain; wait for poses with a heading" in last.output.detail
 
 
 @pytest.mark.thorough

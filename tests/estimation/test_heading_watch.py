@@ -85,3 +85,15 @@ def test_sources_are_followed_each_by_itself():
         assert watch.screen(pose(0.02 * k), 0.02 * k / PER_RAD, PER_RAD)[0].has_heading
         watch.screen(pose(1.0, source=1), 0.02 * k / PER_RAD, PER_RAD)
     assert watch.current == (Heading.MEASURED, Heading.FROZEN)
+
+
+def test_no_heading_is_measured_where_no_source_that_sends_has_one():
+    watch = HeadingWatch(["natnet", "nmea"])
+    assert not watch.measures_none
+    watch.screen(pose(math.nan, math.nan, source=1), 0.0, PER_RAD)
+    assert watch.measures_none
+    assert all(kept(watch, [0.02 * k for k in range(50)]))
+    assert not watch.measures_none
+    kept(watch, [1.0] * 50)
+    assert watch.current == (Heading.FROZEN, Heading.NONE)
+    assert watch.measures_none

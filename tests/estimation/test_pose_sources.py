@@ -222,3 +222,46 @@ def test_one_alone_behaves_as_ever_and_says_nothing():
         assert not fusion.sources.new_messages()
     assert fusion.estimate(DRIVE.wheels[399].t_ns).reinitialisations == 1
     assert fusion.sources.counts() == {}
+
+
+@pytest.mark.parametrize(
+    ("changes", "age_s", "text"),
+    [
+        (
+            {"x_m": 5e5, "y_m": -5e6},
+            0.1,
+            "poses at (500000, -5000000) m are over 1000 m from the origin; set pose.origin",
+        ),
+        ({"yaw_rad": 2e4}, 0.1, "poses have an impossible heading or offset; check the pose sensor and pose.offset"),
+        ({"position_std_m": math.nan}, 0.1, "poses hold what is not a number; check the pose sensor"),
+        (
+            {},
+            1.3,
+            "poses are 1.3 s old, over estimation.history_s = 1; raise it, or correct the clock of the pose sensor",
+        ),
+        ({}, -0.2, "poses are stamped 0.20 s in the future; correct the clock of the pose sensor"),
+    ],
+    ids=["far", "heading", "not a number", "old", "future"],
+)
+def test_the_first_refusal_of_a_kind_is_reported_and_holds_until_a_pose_is_used(changes, age_s, text):
+    fusion = PoseFusion(Estimation(), GEOMETRY, 0.15, ("natnet",))
+    for wheels in DRIVE.wheels[:200]:
+        fusion.add_wheels(wheels)
+    now_ns = wheels.t_ns
+    good = PoseSample(now_ns, now_ns, 1.0, 2.0, 0.3, 0.01, 0.02)
+    for number in range(3):
+        t_ns = now_ns - round(1e9 * age_s) + number
+        fusion.add_pose(msgspec.structs.replace(good, t_ns=t_ns, **changes), now_ns)
+    assert fusion.sources.new_messages() == [f"natnet: {text}"]
+    assert fusion.sources.refusal == f"natnet: {text}"
+    assert fusion.add_pose(good, now_ns).accepted
+    assert (fusion.sources.new_messages(), fusion.sources.refusal) == ([], "")
+
+
+def test_a_pose_from_before_the_first_wheel_sample_needs_no_remedy():
+    fusion = PoseFusion(Estimation(), GEOMETRY, 0.15, ("natnet",))
+    fusion.add_wheels(DRIVE.wheels[0])
+    t_ns = DRIVE.wheels[0].t_ns
+    update = fusion.add_pose(PoseSample(t_ns - 150_000_000, t_ns, 1.0, 2.0, 0.3, 0.01, 0.02), t_ns)
+    assert update.reason is PoseReason.TOO_OLD
+    assert (fusion.sources.new_messages(), fusion.sources.refusal) == ([], "")

@@ -28,10 +28,13 @@ def refusal(out):
 # --- one test per row of the table -----------------------------------------------------------------------------------
 
 STARTS = ["ready", "armed", "running", "stopping"]
-NO_POSE = "no valid pose; check the pose sensor, or set estimation.pose_required = false"
+NO_POSE = "no valid pose; check the pose sensor"
+REFUSED = "udp: poses at (500000, 0) m are over 1000 m from the origin; set pose.origin"
 UNKNOWN_HEADING = (
     "heading not known; the pose sensor measures none: drive one metre straight ahead by hand, on the page, to find it"
 )
+UNCERTAIN_HEADING = "heading too uncertain; wait for poses with a heading, then start again"
+NOT_MEASURED = {"heading_missing": True, "measures_no_heading": True}
 JUMP = "the pose jumped by 1.00 m and 0.10 rad, which the motion of the wheels does not explain"
 AFTER_JUMP = f"{JUMP}; check that the robot is where the page shows it, then start again"
 
@@ -213,11 +216,18 @@ def test_stopping_lasts_until_the_robot_is_disarmed_and_the_wheels_are_still():
     ("pose_required", "lost", "found", "reason"),
     [
         (True, {"pose_ok": False}, {"pose_ok": True}, NO_POSE),
-        (True, {"heading_missing": True}, {"heading_missing": False}, UNKNOWN_HEADING),
-        (False, {"heading_missing": True}, {"heading_missing": False}, UNKNOWN_HEADING),
+        (True, {"pose_ok": False, "pose_refusal": REFUSED}, {"pose_ok": True}, f"no valid pose; {REFUSED}"),
+        (True, NOT_MEASURED, {"heading_missing": False}, UNKNOWN_HEADING),
+        (False, NOT_MEASURED, {"heading_missing": False}, UNKNOWN_HEADING),
+        (
+            True,
+            {"heading_missing": True, "pose_ok": False},
+            {"heading_missing": False, "pose_ok": True},
+            UNCERTAIN_HEADING,
+        ),
         (True, {"pose_jump": JUMP}, {"pose_jump": ""}, AFTER_JUMP),
     ],
-    ids=["pose", "heading", "heading-no-pose-required", "jump"],
+    ids=["pose", "refused", "heading", "heading-no-pose-required", "heading-lost", "jump"],
 )
 def test_without_a_reliable_pose_a_task_stops_for_good_and_none_is_started(pose_required, lost, found, reason):
     bench = Bench(replace(SETTINGS, pose_required=pose_required)).running()
@@ -248,7 +258,8 @@ def test_start_during_arming_starts_once_armed_unless_the_pose_is_lost_meanwhile
 
 
 def test_ready_says_that_the_heading_is_missing():
-    assert "drive one metre" in Bench().ready().tick(heading_missing=True).detail
+    assert "drive one metre" in Bench().ready().tick(**NOT_MEASURED).detail
+    assert Bench().ready().tick(heading_missing=True).detail.endswith(UNCERTAIN_HEADING)
 
 
 @pytest.mark.parametrize("by_hand", [True, False])

@@ -33,6 +33,7 @@ VALUES = {
     "wheel_speed_rad_s": st.sampled_from([0.0, 0.049, 0.05, 3.0, float("nan")]),
     "pose_ok": st.booleans(),
     "heading_missing": st.booleans(),
+    "measures_no_heading": st.booleans(),
     "by_hand": st.booleans(),
     "preflight_errors": st.sampled_from([(), ("limits differ",)]),
     "recording_fault": st.sampled_from(["", "no room"]),

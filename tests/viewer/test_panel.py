@@ -44,12 +44,12 @@ def test_what_fails_is_in_the_summary():
 
 
 def test_of_several_pose_sources_the_details_say_how_each_does():
-    status = PoseSources(("natnet", "nmea"), 0.5)
+    status = PoseSources(("natnet", "nmea"), 0.5, 1.0)
     status.all[0].came_ns, status.all[0].standing, status.all[0].outliers = 1_000_000_000, Standing.GOOD, 3
     text = live_details({**STATUS, "poses": status.status(1_020_000_000)}, None, 0, None)
     assert "| poses 1 | natnet: good, the last 0.02 s ago, 3 outliers |" in text
     assert "| poses 2 | nmea: waiting, none received, 0 outliers |" in text
-    alone = PoseSources(("natnet",), 0.5).status(1_020_000_000)
+    alone = PoseSources(("natnet",), 0.5, 1.0).status(1_020_000_000)
     assert "poses" not in live_details({**STATUS, "poses": alone}, None, 0, None)
 
 

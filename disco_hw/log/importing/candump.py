@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from disco_hw.config import Robot
+from disco_hw.config import RobotConfig
 from disco_hw.errors import LogError
 from disco_hw.files import CANDUMP, read_lines
 from disco_hw.log.drive import DriveLog, Index, Samples, drive_of
@@ -25,6 +25,8 @@ from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.losses import loss_note, warnings_first
 from drivers.device_clock import DeviceClock
 from drivers.motor.reference_frames import POSE_MESSAGES, WHEEL_MESSAGES, FrameReception, Telemetry
+from drivers.pose import AS_OURS
+from drivers.pose.robot import SOURCE as POSES_OF_ROBOT
 from drivers.types import Frame, ReceivedFrame
 from firmware_protocol.codec import Codec, Decoded
 
@@ -182,25 +184,26 @@ class _Rows:
         return len(self.commands) + len(self.wheels) + len(self.poses)
 
 
-def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str = "") -> DriveLog:
+def read_candump(path: Path, config: RobotConfig, channel: str = "") -> DriveLog:
     """Read commands, wheels and poses of a dump, stamped with their reception.
 
-    A command counts until the next one or as long as it is valid. Frames that fail their check are left out and
-    counted. Ticks per revolution and the largest speed, which distinguish a jump from motion, are robot.toml's. Of
-    several channels `channel` is read, or the only one that speaks the protocol, or else `usual_channel`. Raises
-    LogError, also for several robots of which none is named.
+    Wheels are wired, and poses are converted, as robot.toml says. A command counts until the next one or as long as it
+    is valid. Frames that fail their check are left out and counted. Ticks per revolution and the largest speed, which
+    distinguish a jump from motion, are robot.toml's. Of several channels `channel` is read, or the only one that speaks
+    the protocol, or else `link.channel`. Raises LogError, also for several robots of which none is named.
     """
     dump = read_dump(path)
     if channel and channel not in dump.channels:
         raise LogError(f"{path}: no channel {channel}; it has {', '.join(dump.channels)}")
     selected = [channel] if channel else list(dump.channels)
-    found = {each: _decoded(dump, each, robot) for each in selected}
+    found = {each: _decoded(dump, each, config) for each in selected}
     robots = {each: rows for each, rows in found.items() if rows.count}
     if not robots:
         frames = sum(rows.frames for rows in found.values())
         raise LogError(
             f"{path}: {frames} frames, none of them a command, wheel sample or pose of the reference protocol"
         )
+    usual_channel = config.link.channel
     if len(robots) > 1 and usual_channel not in robots:
         counts = ", ".join(f"{each} with {rows.count} records" for each, rows in robots.items())
         raise LogError(f"{path}: several channels hold a robot ({counts}); name one with --channel")
@@ -220,11 +223,13 @@ def read_candump(path: Path, robot: Robot, channel: str = "", usual_channel: str
     return drive_of(str(path), commands, wheels, poses, notes=warnings_first(tuple(notes)))
 
 
-def _decoded(dump: Dump, channel: str, robot: Robot) -> _Rows:
+def _decoded(dump: Dump, channel: str, config: RobotConfig) -> _Rows:
     """Decode the frames of one channel."""
-    codec = Codec()
+    codec, robot, wiring = Codec(), config.robot, config.wheels
+    source = config.pose.of(POSES_OF_ROBOT)
+    convention = AS_OURS if source is None else source.convention()
     reception, telemetry = FrameReception(codec), Telemetry(DeviceClock())
-    telemetry.configure(round(robot.ticks_per_rev), robot.max_wheel_speed_rad_s)
+    telemetry.configure(round(robot.ticks_per_rev), robot.max_wheel_speed_rad_s / wiring.turn_ratio)
     rows = _Rows()
     for received in dump.frames(channel):
         rows.frames += 1
@@ -233,7 +238,7 @@ def _decoded(dump: Dump, channel: str, robot: Robot) -> _Rows:
             values = decoded.values
             given = codec.choice_name(_COMMAND, "mode", values["mode"]) == "SPEED"
             speeds = (values["left_speed"], values["right_speed"]) if given else (np.nan, np.nan)
-            rows.commands.append((received.t_ns, *speeds, values["valid_for"]))
+            rows.commands.append((received.t_ns, *wiring.from_controller(*speeds), values["valid_for"]))
             continue
         believed = reception.accept(received)
         if believed is None:
@@ -241,12 +246,14 @@ def _decoded(dump: Dump, channel: str, robot: Robot) -> _Rows:
         if believed.name in WHEEL_MESSAGES:
             wheel = telemetry.wheels(believed, received.t_ns)
             if wheel is not None:
+                wheel = wiring.true_wheels(wheel)
                 angles = (wheel.left_angle_rad, wheel.right_angle_rad)
                 rows.wheels.append((received.t_ns, *angles, wheel.left_speed_rad_s, wheel.right_speed_rad_s))
         elif believed.name in POSE_MESSAGES:
             pose = telemetry.pose(believed, received.t_ns)
             if pose is not None:
-                rows.poses.append((received.t_ns, pose.x_m, pose.y_m, pose.yaw_rad))
+                pose = convention.converted(pose)
+                rows.poses.append((pose.t_ns, pose.x_m, pose.y_m, pose.yaw_rad))
     rows.refused = reception.rejected_crc + reception.rejected_sequence + reception.rejected_length
     return rows
 
@@ -269,10 +276,4 @@ def _samples(rows: list[Row], width: int) -> Samples:
     return table[:, 0], table[:, 1:]
 
 
-FORMAT = LogFormat(
-    "candump",
-    is_candump,
-    lambda path, config: read_candump(path, config.robot, usual_channel=config.link.channel),
-    order=10,
-    read_channel=lambda path, config, channel: read_candump(path, config.robot, channel),
-)
+FORMAT = LogFormat("candump", is_candump, read_candump, order=10, read_channel=read_candump)

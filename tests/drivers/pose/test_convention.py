@@ -8,9 +8,11 @@ import pytest
 
 from disco_hw.config import load_robot_config
 from disco_hw.errors import InputError
+from disco_hw.runtime import assembly
 from disco_hw.runtime.assembly import driver_of, pose_source_of
 from drivers.motor import RewiredDriver
 from drivers.pose import PoseConvention
+from drivers.pose.robot import RobotPoses
 from drivers.types import PoseSample
 from tests.config.test_robot import GOOD
 
@@ -43,6 +45,16 @@ def test_robot_toml_says_it_and_the_source_converts(load):
     (found,) = source.receive(3, [PoseSample(1, 2, 1000.0, 2000.0, 0.5, 5.0, 0.1)])
     assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx((1.0, 2.0, -0.5))
     source.close()
+
+
+def test_a_source_takes_the_deviations_of_robot_toml_in_the_units_of_its_poses(load, monkeypatch):
+    given = {}
+    monkeypatch.setattr(assembly, "create_pose_source", lambda **fields: given.update(fields) or RobotPoses())
+    text = 'source = "natnet"\nposition_unit = "mm"\nyaw_unit = "deg"\nposition_std_m = 0.02\nyaw_std_rad = 0.03\n'
+    source = pose_source_of(load(f"[pose]\n{text}"))
+    sample = PoseSample(1, 2, 1500.0, 200.0, 30.0, given["position_std_m"], given["yaw_std_rad"])
+    (found,) = source.receive(3, [sample])
+    assert (found.position_std_m, found.yaw_std_rad) == pytest.approx((0.02, 0.03))
 
 
 def test_robot_toml_says_how_the_wheels_are_wired(load):

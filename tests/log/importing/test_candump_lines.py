@@ -3,14 +3,16 @@
 import re
 from datetime import UTC, datetime
 
+import msgspec
 import numpy as np
 import pytest
 
+from disco_hw.config import Link
 from disco_hw.errors import InputError, LogError
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.candump import read_candump
 from tests.inference.test_infer_command import ROBOT as ROBOT_TOML
-from tests.log.importing.test_candump import ROBOT, dumped
+from tests.log.importing.test_candump import CONFIG, dumped
 from tests.log.refusals import refused
 
 _LOGGED = re.compile(r"\((\d+\.\d+)\) can0 ([0-9A-F]{3})#([0-9A-F]*)")
@@ -57,10 +59,10 @@ def differences(frames, write=screen):
     return [write(f"{gap_s:010.6f}", can_id, data) for gap_s, (_, can_id, data) in zip(gaps, frames, strict=True)]
 
 
-def read(tmp_path, lines, end="\n", **settings):
+def read(tmp_path, lines, end="\n", config=CONFIG, **settings):
     path = tmp_path / "dump.log"
     path.write_text("\n".join(lines) + end)
-    return read_candump(path, ROBOT, **settings)
+    return read_candump(path, config, **settings)
 
 
 @pytest.fixture(scope="module")
@@ -161,7 +163,8 @@ def test_of_two_robots_one_must_be_named(tmp_path, frames, reference):
     with refused(r"several channels hold a robot \(can0 with .*, can1 with .*--channel"):
         read(tmp_path, two_robots(frames))
     assert_same(read(tmp_path, two_robots(frames), channel="can0"), reference)
-    assert_same(read(tmp_path, two_robots(frames), usual_channel="can0"), reference)
+    usual = msgspec.structs.replace(CONFIG, link=Link(channel="can0"))
+    assert_same(read(tmp_path, two_robots(frames), config=usual), reference)
     assert read(tmp_path, two_robots(frames), channel="can1").wheels.t_s.size < 0.6 * reference.wheels.t_s.size
     with pytest.raises(LogError, match="no channel can7; it has can0, can1"):
         read(tmp_path, two_robots(frames), channel="can7")
