@@ -241,7 +241,7 @@ class Bridge:
 
     def _handle_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
         fence = self._config.fence
-        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns()):
+        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns(), _publisher_of(message)):
             try:
                 self._obstacle_link.sendto(datagram, (fence.obstacles_address, fence.obstacles_port))
             except OSError:
