@@ -13,6 +13,7 @@ import importlib.util
 import json
 import math
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -144,6 +145,8 @@ _HIGHEST_M = 10_000.0
 _SEMI_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 # Above NMEA 0183's 82 characters, which receivers exceed in fields of their own.
 _LONGEST_LINE = 256
+# Talker and type; binary data may hold a dollar sign.
+_SENTENCE = re.compile(rb"\$[A-Z]{4}")
 # docs/poses.md: above the period of a receiver at 1 Hz, with a sentence or two lost.
 _SILENT_S = 3.0
 # Chosen: how late a heading's wait ends and an end is noticed.
@@ -414,8 +417,10 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
                 while True:
                     kept += port.read(max(1, min(port.in_waiting, _LONGEST_LINE)))
                     *lines, kept = kept.split(b"\n")
-                    for line in lines:
-                        if line.startswith(b"$"):
+                    for after_newline in lines:
+                        # A binary block of the receiver's own protocol ends with no newline.
+                        line = after_newline[max(after_newline.rfind(b"$"), 0) :]
+                        if _SENTENCE.match(line):
                             received_s, is_silence_reported, tries = time.monotonic(), False, 0
                         yield line + b"\n", None
                     kept = kept[-_LONGEST_LINE:]

@@ -14,7 +14,7 @@ import pytest
 
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.pose import PoseSourceError, create_pose_source
-from drivers.pose.nmea import QUALITY_STD_M, Fixes, NmeaPoses, ReceiverClock, TangentPlane
+from drivers.pose.nmea import QUALITY_STD_M, Fixes, NmeaPoses, ReceiverClock, TangentPlane, _lines
 from tests.drivers.waiting import receive_until
 from tests.runtime.simulated import simulated_stack
 
@@ -270,6 +270,32 @@ def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(create_source)
             again.sendall(gga(40_000.0, 47.0, 8.5))
             (pose,), _ = receive_until(source, lambda found, _: found)
             assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_a_binary_block_before_a_sentence_costs_no_position(create_source):
+    """Receivers mix UBX, SBF or RTCM with NMEA; those end with no newline, and may hold a dollar sign."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        source = create_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        receiver, _ = server.accept()
+        opened(source)
+        with receiver:
+            for k in range(5):
+                receiver.sendall(b"\xb5\x62\x01$\x07" + bytes(range(128, 228)) + gga(0.2 * k, 47.0, 8.5))
+            found, _ = receive_until(source, lambda found, _: len(found) == 5)
+    assert len(found) == 5
+
+
+def test_binary_data_alone_is_no_sentence(monkeypatch):
+    monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.05)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    for line, text in _lines(os.ttyname(slave), 115_200):
+        if text is None:
+            os.write(master, b"\xb5$\x07\x01\x02\n")
+        elif "no NMEA sentence" in text:
+            break
+    os.close(slave)
+    os.close(master)
 
 
 def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(create_source):
