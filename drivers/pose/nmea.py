@@ -132,9 +132,11 @@ _LEAST_STD_M = 0.005
 _HINT_NS = 10_000_000_000
 # Chosen: GST may come less often than GGA; two of it may be missed at 1 Hz.
 _GST_HOLDS_S = 2.5
-# docs/poses.md: a heading belongs to the position within it; longer than an epoch's sentences take on the line, shorter
+# docs/poses.md: a position waits so long for its heading; longer than an epoch's sentences take on the line, shorter
 # than 10 Hz.
 _PAIR_NS = 60_000_000
+# docs/poses.md: a heading that came first waits so long for its position; an older one is of the epoch before.
+_HEADING_FIRST_NS = 20_000_000
 # Chosen: a receiver that sent no heading for so long no longer makes positions wait for one.
 _HEADING_HOLDS_NS = 2_000_000_000
 # Chosen: longer finds a smaller delay, shorter follows a drifting clock sooner.
@@ -225,7 +227,7 @@ class Fixes:
     """Conversion of NMEA sentences into poses: `add_line` each with its arrival, `flush` now and then; pure.
 
     What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
-    or the better. A heading belongs to the position that came within 60 ms of it.
+    or the better. A heading belongs to one position: that which waits for it, or else the next one within 20 ms.
     """
 
     datum: tuple[float, float] | None = None
@@ -235,6 +237,7 @@ class Fixes:
     _quality: int | None = None
     _gst: tuple[float, float] | None = None
     _heading: _HeadingSentence | None = None
+    _unused_heading: _HeadingSentence | None = None
     _waiting: dict[str, Any] | None = None
     _waits_since_ns: int = 0
     _height_m: float | None = None
@@ -259,10 +262,12 @@ class Fixes:
 
     def flush(self, now_ns: int) -> list[dict[str, Any]]:
         """Give the position that has waited for a heading long enough."""
-        if self._waiting is None or now_ns - self._waits_since_ns < _PAIR_NS:
-            return []
+        return [] if now_ns - self._waits_since_ns < _PAIR_NS else self._end_wait()
+
+    def _end_wait(self) -> list[dict[str, Any]]:
+        """Give the position that waits for a heading, without one."""
         waiting, self._waiting = self._waiting, None
-        return [waiting]
+        return [] if waiting is None else [waiting]
 
     def _handle(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
         kind = "" if message is None else message.msgID
@@ -287,8 +292,9 @@ class Fixes:
         if not isinstance(heading_deg, float) or not 0.0 <= heading_deg <= 360.0:
             return []
         self._heading = _HeadingSentence(arrival_ns, heading_deg, self._quality in WIDE_HEADING_QUALITIES)
-        waiting, self._waiting = self._waiting, None
-        return [] if waiting is None else [self._with_heading(waiting, self._heading)]
+        waiting = self._end_wait()
+        self._unused_heading = None if waiting else self._heading
+        return [self._with_heading(position, self._heading) for position in waiting]
 
     def _handle_position(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
         quality, time_s, hdop = message.quality, _time_of_day_s(message.time), message.HDOP
@@ -315,10 +321,12 @@ class Fixes:
             "y_m": north_m,
             "position_std_m": self._deviation_m(quality, time_s, hdop),
         }
+        notes += self._end_wait()
+        heading, self._unused_heading = self._unused_heading, None
+        if heading is not None and arrival_ns - heading.arrival_ns < _HEADING_FIRST_NS:
+            return [*notes, self._with_heading(position, heading)]
         if self._heading is None or arrival_ns - self._heading.arrival_ns > _HEADING_HOLDS_NS:
             return [*notes, position]
-        if arrival_ns - self._heading.arrival_ns < _PAIR_NS:
-            return [*notes, self._with_heading(position, self._heading)]
         self._waiting, self._waits_since_ns = position, arrival_ns
         return notes
 

@@ -180,6 +180,35 @@ def test_a_heading_goes_with_the_position_of_the_same_burst(order):
     assert "yaw_rad" not in bare
 
 
+def epochs(position_hz, heading_hz, heading_ms, seconds=2):
+    """Return the poses of a receiver whose headings, 1 degree per 10 ms, come `heading_ms` after their positions."""
+    fixes, lines = Fixes(), []
+    for k in range(position_hz * seconds):
+        at_ms = 1000 * k // position_hz
+        lines.append((at_ms, gga(at_ms / 1000, 47.0, 8.0)))
+        if k % (position_hz // heading_hz) == 0:
+            lines.append((at_ms + heading_ms, sentence(f"GNHDT,{at_ms / 10:.1f},T")))
+    found = []
+    for at_ms, line in sorted(lines):
+        found += fixes.add_line(line, NOW_NS + at_ms * 1_000_000)
+    return poses(found + fixes.flush(NOW_NS + 10**10))
+
+
+@pytest.mark.parametrize(
+    ("position_hz", "heading_hz", "heading_ms"),
+    [(20, 1, 2), (20, 5, 2), (20, 20, 2), (10, 10, 2), (10, 10, 45), (10, 10, -10), (20, 20, -10), (5, 1, 30)],
+)  # fmt: skip
+def test_no_position_is_lost_and_each_heading_goes_with_the_position_of_its_epoch(position_hz, heading_hz, heading_ms):
+    found = epochs(position_hz, heading_hz, heading_ms)
+    at_s = [round((pose["t_ns"] - found[0]["t_ns"]) * 1e-9, 3) for pose in found]
+    assert at_s == [k / position_hz for k in range(2 * position_hz)]
+    with_heading = {at: pose["yaw_rad"] for at, pose in zip(at_s, found, strict=True) if "yaw_rad" in pose}
+    # The first position does not wait, as no heading was seen yet.
+    assert len(with_heading) >= 2 * heading_hz - 1
+    for at, yaw_rad in with_heading.items():
+        assert math.remainder(yaw_rad - math.radians(90.0 - 100.0 * at), math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     clock = ReceiverClock()
     delays_s = [0.15, 0.05, 0.30, 0.05, 0.80, 0.06]
@@ -289,7 +318,7 @@ def test_binary_data_alone_is_no_sentence(monkeypatch):
     monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.05)
     master, slave = os.openpty()
     tty.setraw(slave)
-    for line, text in _lines(os.ttyname(slave), 115_200):
+    for _, text in _lines(os.ttyname(slave), 115_200):
         if text is None:
             os.write(master, b"\xb5$\x07\x01\x02\n")
         elif "no NMEA sentence" in text:
