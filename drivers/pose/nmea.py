@@ -416,12 +416,16 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
     """Lines as they come, empty ones where none has come for a moment, and words where something is wrong; endless."""
     import serial  # noqa: PLC0415
 
-    tries = 0
+    # A server that lost its power says nothing on its old connection, ever; a serial port goes on by itself.
+    is_network = "://" in device
+    hint = "connecting again; check the receiver" if is_network else "check the receiver and pose.baud"
+    tries, is_silent = 0, False
     while True:
         try:
             with serial.serial_for_url(device, baudrate=baud, timeout=_READ_S) as port:
-                yield b"", f"{device}: open"
-                received_s, kept, is_silence_reported = time.monotonic(), b"", False
+                if not is_silent:
+                    yield b"", f"{device}: open"
+                received_s, kept = time.monotonic(), b""
                 while True:
                     kept += port.read(max(1, min(port.in_waiting, _LONGEST_LINE)))
                     *lines, kept = kept.split(b"\n")
@@ -429,14 +433,21 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
                         # A binary block of the receiver's own protocol ends with no newline.
                         line = after_newline[max(after_newline.rfind(b"$"), 0) :]
                         if _SENTENCE.match(line):
-                            received_s, is_silence_reported, tries = time.monotonic(), False, 0
+                            received_s, tries = time.monotonic(), 0
+                            if is_silent:
+                                is_silent = False
+                                yield b"", f"{device}: NMEA sentences received again"
                         yield line + b"\n", None
                     kept = kept[-_LONGEST_LINE:]
-                    if time.monotonic() - received_s > _SILENT_S and not is_silence_reported:
-                        is_silence_reported = True
-                        yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; check the receiver and pose.baud"
+                    if time.monotonic() - received_s > _SILENT_S:
+                        if not is_silent:
+                            is_silent = True
+                            yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; {hint}"
+                        if is_network:
+                            break
                     yield b"", None
         except (OSError, ValueError) as error:
+            is_silent = False
             # serial.SerialException is an OSError.
             yield b"", f"{device}: {error}; trying again until it is there"
         wait_s = _RETRY_S[min(tries, len(_RETRY_S) - 1)]

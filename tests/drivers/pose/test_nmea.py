@@ -1,5 +1,6 @@
 """A GPS receiver: the vendors' own sentences, a library's, a real port and a real socket, and a reader killed."""
 
+import itertools
 import json
 import math
 import os
@@ -8,6 +9,7 @@ import socket
 import subprocess
 import time
 import tty
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime, timedelta
 
 import pytest
@@ -325,6 +327,47 @@ def test_binary_data_alone_is_no_sentence(monkeypatch):
             break
     os.close(slave)
     os.close(master)
+
+
+def test_over_tcp_a_receiver_that_falls_silent_is_connected_to_again(monkeypatch):
+    """One that lost its power says nothing, and knows nothing of its old connection afterwards."""
+    monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.1)
+    monkeypatch.setattr("drivers.pose.nmea._RETRY_S", (0.0,))
+    with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as connections:
+        device = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        lines = _lines(device, 115_200)
+        assert next(lines) == (b"", f"{device}: open")
+        connections.enter_context(server.accept()[0])
+        (text,) = messages_until(lines, 1)
+        assert text == f"{device}: no NMEA sentence for 0 s; connecting again; check the receiver"
+        server.setblocking(False)
+        for _, text in lines:
+            with suppress(BlockingIOError):
+                connections.enter_context(server.accept()[0]).sendall(GGA_ALONE)
+            if text is not None:
+                break
+        assert text == f"{device}: NMEA sentences received again"
+
+
+def test_a_serial_port_that_falls_silent_stays_open(monkeypatch):
+    monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.05)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    lines = _lines(os.ttyname(slave), 115_200)
+    next(lines)
+    (text,) = messages_until(lines, 1)
+    assert text.endswith(": no NMEA sentence for 0 s; check the receiver and pose.baud")
+    # Were it opened again, this would be thrown away.
+    os.write(master, GGA_ALONE)
+    assert messages_until(lines, 1)[0].endswith(": NMEA sentences received again")
+    assert messages_until(lines, 1)[0].endswith(": no NMEA sentence for 0 s; check the receiver and pose.baud")
+    os.close(slave)
+    os.close(master)
+
+
+def messages_until(lines, count):
+    """Return the next messages of the port's reader; what it reads is left out."""
+    return list(itertools.islice((text for _, text in itertools.islice(lines, 1000) if text is not None), count))
 
 
 def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(create_source):
