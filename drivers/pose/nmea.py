@@ -243,6 +243,7 @@ class Fixes:
     _height_m: float | None = None
     _first_ns: int | None = None
     _heading_mode: str = "A"
+    _is_heading_lost: bool = False
     _reported: set[str] = field(default_factory=set)
     _far: bool = False
     _clock: ReceiverClock = field(default_factory=ReceiverClock)
@@ -292,9 +293,11 @@ class Fixes:
         if not isinstance(heading_deg, float) or not 0.0 <= heading_deg <= 360.0:
             return []
         self._heading = _HeadingSentence(arrival_ns, heading_deg, self._quality in WIDE_HEADING_QUALITIES)
+        notes = [{"said": "headings received again"}] if self._is_heading_lost else []
+        self._is_heading_lost = False
         waiting = self._end_wait()
         self._unused_heading = None if waiting else self._heading
-        return [self._with_heading(position, self._heading) for position in waiting]
+        return notes + [self._with_heading(position, self._heading) for position in waiting]
 
     def _handle_position(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
         quality, time_s, hdop = message.quality, _time_of_day_s(message.time), message.HDOP
@@ -357,10 +360,14 @@ class Fixes:
         return {**position, "yaw_rad": yaw_rad, "yaw_std_rad": std_rad}
 
     def _heading_hint(self, arrival_ns: int) -> list[dict[str, Any]]:
-        """Return which sentence brings a heading, once, where none has come for a while."""
+        """Return which sentence brings a heading, once, where none has ever come; else each loss of it."""
         first_ns = self._first_ns = arrival_ns if self._first_ns is None else self._first_ns
-        if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
+        last_ns = first_ns if self._heading is None else self._heading.arrival_ns
+        if self._is_heading_lost or arrival_ns - last_ns < _HINT_NS:
             return []
+        if self._heading is not None:
+            self._is_heading_lost = True
+            return [{"said": f"no heading for {_HINT_NS // 1_000_000_000} s; positions only"}]
         return self._without_repeats(
             "the receiver sends no heading, positions only; if it has two antennas, switch on its sentence HDT or THS"
         )

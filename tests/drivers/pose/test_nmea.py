@@ -488,3 +488,16 @@ def test_where_no_heading_comes_the_sentences_that_bring_one_are_named_once():
     assert len(messages_over(30)) == 1
     assert messages_over(9) == []
     assert messages_over(30, HDT) == []
+
+
+@pytest.mark.parametrize("heading", [HDT, sentence("GNTHS,123.4,A")], ids=["HDT", "THS"])
+def test_each_loss_of_the_heading_is_reported_and_its_return(heading):
+    fixes, found = Fixes(), []
+    for k in range(5 * 60):
+        at_ns = NOW_NS + 200_000_000 * k
+        found += fixes.add_line(fix(4), at_ns)
+        # It comes for 10 s, is away for 20 s, and comes for 5 s; then it stays away.
+        if k < 50 or 150 <= k < 175:
+            found += fixes.add_line(heading, at_ns + 1_000_000)
+    lost, back = "no heading for 10 s; positions only", "headings received again"
+    assert [message for message in messages_of(found) if "heading" in message] == [lost, back, lost]
