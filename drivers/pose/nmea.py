@@ -132,8 +132,8 @@ _LEAST_STD_M = 0.005
 _HINT_NS = 10_000_000_000
 # Chosen: GST may come less often than GGA; two of it may be missed at 1 Hz.
 _GST_HOLDS_S = 2.5
-# docs/poses.md: a position waits so long for its heading; longer than an epoch's sentences take on the line, shorter
-# than 10 Hz.
+# docs/poses.md: a position waits so long for its heading, but half the time to the next position at most, or the next
+# heading would be taken for its own; longer than an epoch's sentences take on the line.
 _PAIR_NS = 60_000_000
 # docs/poses.md: a heading that came first waits so long for its position; an older one is of the epoch before.
 _HEADING_FIRST_NS = 20_000_000
@@ -240,6 +240,8 @@ class Fixes:
     _unused_heading: _HeadingSentence | None = None
     _waiting: dict[str, Any] | None = None
     _waits_since_ns: int = 0
+    _waits_for_ns: int = _PAIR_NS
+    _position_time_s: float | None = None
     _height_m: float | None = None
     _first_ns: int | None = None
     _heading_mode: str = "A"
@@ -263,7 +265,7 @@ class Fixes:
 
     def flush(self, now_ns: int) -> list[dict[str, Any]]:
         """Give the position that has waited for a heading long enough."""
-        return [] if now_ns - self._waits_since_ns < _PAIR_NS else self._end_wait()
+        return [] if now_ns - self._waits_since_ns < self._waits_for_ns else self._end_wait()
 
     def _end_wait(self) -> list[dict[str, Any]]:
         """Give the position that waits for a heading, without one."""
@@ -325,6 +327,7 @@ class Fixes:
             "position_std_m": self._deviation_m(quality, time_s, hdop),
         }
         notes += self._end_wait()
+        self._waits_for_ns = self._longest_wait_ns(time_s)
         heading, self._unused_heading = self._unused_heading, None
         if heading is not None and arrival_ns - heading.arrival_ns < _HEADING_FIRST_NS:
             return [*notes, self._with_heading(position, heading)]
@@ -332,6 +335,12 @@ class Fixes:
             return [*notes, position]
         self._waiting, self._waits_since_ns = position, arrival_ns
         return notes
+
+    def _longest_wait_ns(self, time_s: float) -> int:
+        """Return how long this position waits for its heading."""
+        before_s, self._position_time_s = self._position_time_s, time_s
+        epoch_s = 0.0 if before_s is None else abs(math.remainder(time_s - before_s, DAY_S))
+        return min(_PAIR_NS, round(0.5e9 * epoch_s) or _PAIR_NS)
 
     def _deviation_m(self, quality: int, time_s: float, hdop: Any) -> float:
         if self._gst is not None and abs(math.remainder(time_s - self._gst[0], DAY_S)) < _GST_HOLDS_S:

@@ -211,6 +211,17 @@ def test_no_position_is_lost_and_each_heading_goes_with_the_position_of_its_epoc
         assert math.remainder(yaw_rad - math.radians(90.0 - 100.0 * at), math.tau) == pytest.approx(0.0, abs=1e-9)
 
 
+def test_a_lost_heading_does_not_shift_those_after_it():
+    fixes, found = Fixes(), []
+    for k in range(20):
+        at_ms = 50 * k
+        if k != 8:
+            found += fixes.add_line(sentence(f"GNHDT,{k}.0,T"), NOW_NS + (at_ms - 10) * 1_000_000)
+        found += fixes.add_line(gga(at_ms / 1000, 47.0, 8.0), NOW_NS + at_ms * 1_000_000)
+    headings = [pose.get("yaw_rad") for pose in poses(found + fixes.flush(NOW_NS + 10**10))]
+    assert headings == pytest.approx([None if k == 8 else math.radians(90.0 - k) for k in range(20)], abs=1e-9)
+
+
 def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     clock = ReceiverClock()
     delays_s = [0.15, 0.05, 0.30, 0.05, 0.80, 0.06]
