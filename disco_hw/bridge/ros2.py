@@ -194,7 +194,8 @@ class Bridge:
             yield self._reader(namespace, ros2_obstacles.TOPIC, obstacles, SENSOR), self._handle_obstacles
         yield self._reader(namespace, CTL, msg.String, RELIABLE, SENSOR), self._handle_request
         # Each by itself: an e-stop that counts twice does no harm, and it must not wait for what was lost before it.
-        for qos in (RELIABLE, SENSOR):
+        # Latched, too: one that was pressed before this process began is in force, unlike a request of then.
+        for qos in (LATCHED, RELIABLE, SENSOR):
             yield self._reader(namespace, ESTOP, msg.Bool, qos), self._handle_estop
 
     def _reader(self, namespace: str, topic: str, kind: Any, *qualities: Qos) -> TopicReaders:
@@ -241,7 +242,7 @@ class Bridge:
 
     def _handle_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
         fence = self._config.fence
-        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns()):
+        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns(), _publisher_of(message)):
             try:
                 self._obstacle_link.sendto(datagram, (fence.obstacles_address, fence.obstacles_port))
             except OSError:

@@ -301,7 +301,11 @@ class WheelInlet:
         if not at.keys() >= self._joints or len(message.position) < len(message.name):
             return None
         angles = _means(sides, at, message.position)
-        if len(message.velocity) == len(message.name):
+        # joint_state_broadcaster writes NaN where a joint has no velocity interface.
+        is_measured = len(message.velocity) == len(message.name) and not any(
+            math.isnan(message.velocity[at[name]]) for name in self._joints
+        )
+        if is_measured:
             return angles, _means(sides, at, message.velocity)
         if self._before is None:
             return angles, (0.0, 0.0)

@@ -48,7 +48,7 @@ _Speed = Annotated[float, Meta(ge=-_FASTEST_M_S, le=_FASTEST_M_S)]
 class ObstacleReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Report of one obstacle: centre and radius (m) and velocity (m/s) in the pose frame, `age_s` ago.
 
-    `age_limit_s`: how long the report may be relied on.
+    `age_limit_s`: how long the report may be relied on. `removed`: the obstacle is gone, and the robot need not stop.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_.-]+$")]
@@ -59,6 +59,7 @@ class ObstacleReport(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     vy_m_s: _Speed = 0.0
     age_s: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.0
     age_limit_s: Annotated[float, Meta(gt=0.0, le=86400.0)] = REPORTED_AGE_LIMIT_S
+    removed: bool = False
 
 
 class ObstacleRefused(Exception):  # noqa: N818

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -100,9 +101,18 @@ class SafeArea:
         return text
 
     def report(self, now_ns: int, report: ObstacleReport) -> None:
-        """Take in one obstacle. Raises ObstacleRefused."""
+        """Take in one obstacle, or that it is gone. Raises ObstacleRefused."""
+        if report.removed:
+            # Senders repeat it, as a datagram can be lost.
+            with contextlib.suppress(ObstacleRefused):
+                self._remove(now_ns, report.name)
+            return
         self.obstacles.report(now_ns, report)
         self._pending.append(records.Obstacle(now_ns, *msgspec.structs.astuple(report)))
+
+    def _remove(self, now_ns: int, name: str) -> None:
+        self.obstacles.remove(name)
+        self._pending.append(records.Obstacle(now_ns, name, removed=True))
 
     def notify(self, messages: Iterable[str]) -> None:
         """Have these sentences on obstacles reported as events of this tick."""
@@ -112,7 +122,7 @@ class SafeArea:
         """Add or remove the obstacle that a person names; returns the answer in words. Raises ObstacleRefused."""
         fields = dict(requested)
         match fields.pop("change", None):
-            case "add":
+            case "add" if "removed" not in fields:
                 report = report_from(fields, ENTERED_AGE_LIMIT_S)
                 self.report(now_ns, report)
                 return (
@@ -121,8 +131,7 @@ class SafeArea:
                 )
             case "remove" if set(fields) == {"name"}:
                 name = str(fields["name"])
-                self.obstacles.remove(name)
-                self._pending.append(records.Obstacle(now_ns, name, removed=True))
+                self._remove(now_ns, name)
                 return f"obstacle {name}: removed"
         raise ObstacleRefused("obstacle: write add or remove, such as obstacle remove name=pillar")
 

@@ -235,6 +235,7 @@ class NatNetPoses:
         self._ticks_per_s: float | None = None
         self._first: MotiveFrame | None = None
         self._state = ""
+        self._unsupported: Version | None = None
         self._messages: list[str] = []
         self.malformed = self.lost = 0
 
@@ -307,8 +308,9 @@ class NatNetPoses:
             version = struct.unpack_from("<4B", datagram, 4 + _NAME_LENGTH + 4)[:2]
             if version in VERSIONS.values():
                 self._version = version
-            else:
-                self._note(f"the server uses NatNet {_text(version)}, supported are {', '.join(VERSIONS)}")
+            elif version != self._unsupported:
+                self._unsupported = version
+                self._messages.append(f"the server uses NatNet {_text(version)}, supported are {', '.join(VERSIONS)}")
             if version >= (3, 0):
                 (ticks_per_s,) = struct.unpack_from("<Q", datagram, 4 + _NAME_LENGTH + 8)
                 self._ticks_per_s = float(ticks_per_s) or None

@@ -13,6 +13,7 @@ import importlib.util
 import json
 import math
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -131,9 +132,11 @@ _LEAST_STD_M = 0.005
 _HINT_NS = 10_000_000_000
 # Chosen: GST may come less often than GGA; two of it may be missed at 1 Hz.
 _GST_HOLDS_S = 2.5
-# docs/poses.md: a heading belongs to the position within it; longer than an epoch's sentences take on the line, shorter
-# than 10 Hz.
+# docs/poses.md: a position waits so long for its heading, but half the time to the next position at most, or the next
+# heading would be taken for its own; longer than an epoch's sentences take on the line.
 _PAIR_NS = 60_000_000
+# docs/poses.md: a heading that came first waits so long for its position; an older one is of the epoch before.
+_HEADING_FIRST_NS = 20_000_000
 # Chosen: a receiver that sent no heading for so long no longer makes positions wait for one.
 _HEADING_HOLDS_NS = 2_000_000_000
 # Chosen: longer finds a smaller delay, shorter follows a drifting clock sooner.
@@ -144,6 +147,8 @@ _HIGHEST_M = 10_000.0
 _SEMI_MAJOR_M, _FLATTENING = 6_378_137.0, 1.0 / 298.257223563
 # Above NMEA 0183's 82 characters, which receivers exceed in fields of their own.
 _LONGEST_LINE = 256
+# Talker and type; binary data may hold a dollar sign.
+_SENTENCE = re.compile(rb"\$[A-Z]{4}")
 # docs/poses.md: above the period of a receiver at 1 Hz, with a sentence or two lost.
 _SILENT_S = 3.0
 # Chosen: how late a heading's wait ends and an end is noticed.
@@ -222,7 +227,7 @@ class Fixes:
     """Conversion of NMEA sentences into poses: `add_line` each with its arrival, `flush` now and then; pure.
 
     What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
-    or the better. A heading belongs to the position that came within 60 ms of it.
+    or the better. A heading belongs to one position: that which waits for it, or else the next one within 20 ms.
     """
 
     datum: tuple[float, float] | None = None
@@ -232,11 +237,15 @@ class Fixes:
     _quality: int | None = None
     _gst: tuple[float, float] | None = None
     _heading: _HeadingSentence | None = None
+    _unused_heading: _HeadingSentence | None = None
     _waiting: dict[str, Any] | None = None
     _waits_since_ns: int = 0
+    _waits_for_ns: int = _PAIR_NS
+    _position_time_s: float | None = None
     _height_m: float | None = None
     _first_ns: int | None = None
     _heading_mode: str = "A"
+    _is_heading_lost: bool = False
     _reported: set[str] = field(default_factory=set)
     _far: bool = False
     _clock: ReceiverClock = field(default_factory=ReceiverClock)
@@ -256,10 +265,12 @@ class Fixes:
 
     def flush(self, now_ns: int) -> list[dict[str, Any]]:
         """Give the position that has waited for a heading long enough."""
-        if self._waiting is None or now_ns - self._waits_since_ns < _PAIR_NS:
-            return []
+        return [] if now_ns - self._waits_since_ns < self._waits_for_ns else self._end_wait()
+
+    def _end_wait(self) -> list[dict[str, Any]]:
+        """Give the position that waits for a heading, without one."""
         waiting, self._waiting = self._waiting, None
-        return [waiting]
+        return [] if waiting is None else [waiting]
 
     def _handle(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
         kind = "" if message is None else message.msgID
@@ -284,8 +295,11 @@ class Fixes:
         if not isinstance(heading_deg, float) or not 0.0 <= heading_deg <= 360.0:
             return []
         self._heading = _HeadingSentence(arrival_ns, heading_deg, self._quality in WIDE_HEADING_QUALITIES)
-        waiting, self._waiting = self._waiting, None
-        return [] if waiting is None else [self._with_heading(waiting, self._heading)]
+        notes = [{"said": "headings received again"}] if self._is_heading_lost else []
+        self._is_heading_lost = False
+        waiting = self._end_wait()
+        self._unused_heading = None if waiting else self._heading
+        return notes + [self._with_heading(position, self._heading) for position in waiting]
 
     def _handle_position(self, message: Any, arrival_ns: int) -> list[dict[str, Any]]:
         quality, time_s, hdop = message.quality, _time_of_day_s(message.time), message.HDOP
@@ -312,12 +326,21 @@ class Fixes:
             "y_m": north_m,
             "position_std_m": self._deviation_m(quality, time_s, hdop),
         }
+        notes += self._end_wait()
+        self._waits_for_ns = self._longest_wait_ns(time_s)
+        heading, self._unused_heading = self._unused_heading, None
+        if heading is not None and arrival_ns - heading.arrival_ns < _HEADING_FIRST_NS:
+            return [*notes, self._with_heading(position, heading)]
         if self._heading is None or arrival_ns - self._heading.arrival_ns > _HEADING_HOLDS_NS:
             return [*notes, position]
-        if arrival_ns - self._heading.arrival_ns < _PAIR_NS:
-            return [*notes, self._with_heading(position, self._heading)]
         self._waiting, self._waits_since_ns = position, arrival_ns
         return notes
+
+    def _longest_wait_ns(self, time_s: float) -> int:
+        """Return how long this position waits for its heading."""
+        before_s, self._position_time_s = self._position_time_s, time_s
+        epoch_s = 0.0 if before_s is None else abs(math.remainder(time_s - before_s, DAY_S))
+        return min(_PAIR_NS, round(0.5e9 * epoch_s) or _PAIR_NS)
 
     def _deviation_m(self, quality: int, time_s: float, hdop: Any) -> float:
         if self._gst is not None and abs(math.remainder(time_s - self._gst[0], DAY_S)) < _GST_HOLDS_S:
@@ -346,10 +369,14 @@ class Fixes:
         return {**position, "yaw_rad": yaw_rad, "yaw_std_rad": std_rad}
 
     def _heading_hint(self, arrival_ns: int) -> list[dict[str, Any]]:
-        """Return which sentence brings a heading, once, where none has come for a while."""
+        """Return which sentence brings a heading, once, where none has ever come; else each loss of it."""
         first_ns = self._first_ns = arrival_ns if self._first_ns is None else self._first_ns
-        if self._heading is not None or arrival_ns - first_ns < _HINT_NS:
+        last_ns = first_ns if self._heading is None else self._heading.arrival_ns
+        if self._is_heading_lost or arrival_ns - last_ns < _HINT_NS:
             return []
+        if self._heading is not None:
+            self._is_heading_lost = True
+            return [{"said": f"no heading for {_HINT_NS // 1_000_000_000} s; positions only"}]
         return self._without_repeats(
             "the receiver sends no heading, positions only; if it has two antennas, switch on its sentence HDT or THS"
         )
@@ -405,25 +432,38 @@ def _lines(device: str, baud: int) -> Iterator[tuple[bytes, str | None]]:
     """Lines as they come, empty ones where none has come for a moment, and words where something is wrong; endless."""
     import serial  # noqa: PLC0415
 
-    tries = 0
+    # A server that lost its power says nothing on its old connection, ever; a serial port goes on by itself.
+    is_network = "://" in device
+    hint = "connecting again; check the receiver" if is_network else "check the receiver and pose.baud"
+    tries, is_silent = 0, False
     while True:
         try:
             with serial.serial_for_url(device, baudrate=baud, timeout=_READ_S) as port:
-                yield b"", f"{device}: open"
-                received_s, kept, is_silence_reported = time.monotonic(), b"", False
+                if not is_silent:
+                    yield b"", f"{device}: open"
+                received_s, kept = time.monotonic(), b""
                 while True:
                     kept += port.read(max(1, min(port.in_waiting, _LONGEST_LINE)))
                     *lines, kept = kept.split(b"\n")
-                    for line in lines:
-                        if line.startswith(b"$"):
-                            received_s, is_silence_reported, tries = time.monotonic(), False, 0
+                    for after_newline in lines:
+                        # A binary block of the receiver's own protocol ends with no newline.
+                        line = after_newline[max(after_newline.rfind(b"$"), 0) :]
+                        if _SENTENCE.match(line):
+                            received_s, tries = time.monotonic(), 0
+                            if is_silent:
+                                is_silent = False
+                                yield b"", f"{device}: NMEA sentences received again"
                         yield line + b"\n", None
                     kept = kept[-_LONGEST_LINE:]
-                    if time.monotonic() - received_s > _SILENT_S and not is_silence_reported:
-                        is_silence_reported = True
-                        yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; check the receiver and pose.baud"
+                    if time.monotonic() - received_s > _SILENT_S:
+                        if not is_silent:
+                            is_silent = True
+                            yield b"", f"{device}: no NMEA sentence for {_SILENT_S:.0f} s; {hint}"
+                        if is_network:
+                            break
                     yield b"", None
         except (OSError, ValueError) as error:
+            is_silent = False
             # serial.SerialException is an OSError.
             yield b"", f"{device}: {error}; trying again until it is there"
         wait_s = _RETRY_S[min(tries, len(_RETRY_S) - 1)]

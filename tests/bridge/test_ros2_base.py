@@ -84,6 +84,17 @@ def test_without_velocities_the_speeds_are_those_of_the_angles(inlet):
     assert pass_wheels(inlet, joints(20, (1.1, 1.9), None), 20).speeds_rad_s == pytest.approx((5.0, -5.0))
 
 
+def test_velocities_that_are_not_measured_are_as_if_there_were_none(inlet):
+    """joint_state_broadcaster writes NaN where a joint has no velocity interface."""
+    assert pass_wheels(inlet, joints(0, speeds=(math.nan, math.nan))).speeds_rad_s == (0.0, 0.0)
+    wheels = pass_wheels(inlet, joints(20, (1.1, 1.9), (0.5, math.nan)), 20)
+    assert wheels.speeds_rad_s == pytest.approx((5.0, -5.0))
+    others = joints(40, speeds=(0.5, 1.5))
+    others.velocity[others.name.index("arm")] = math.nan
+    assert pass_wheels(inlet, others, 40).speeds_rad_s == pytest.approx((0.5, 1.5))
+    assert not inlet.refused
+
+
 def test_joints_of_an_arm_alone_are_nothing_and_not_refused(inlet):
     assert pass_wheels(inlet, joints(0, names=("arm",))) is None
     assert not inlet.refused

@@ -270,6 +270,30 @@ def test_over_dds_an_estop_and_requests_arrive_whatever_the_publishers_quality_o
     assert "estop" in requests
 
 
+def test_over_dds_a_latched_estop_that_was_pressed_before_the_bridge_started_arrives(tmp_path, monkeypatch):
+    number, requests, ended = 14 + os.getpid() % 20 * 3, [], threading.Event()
+    joined = Domain(number, msg.LOOPBACK), DomainParticipant(number)
+    monkeypatch.setattr("disco_hw.bridge.ros2.join_domain", lambda _: joined)
+    writers = [
+        DataWriter(joined[1], Topic(joined[1], f"rt/{name}", kind), qualities(reliable=True, latched=True))
+        for name, kind in (("disco_hw/estop", msg.Bool), ("disco_hw/ctl", msg.String))
+    ]
+    writers[0].write(msg.Bool(True))
+    # A request is of the time at which it was made.
+    writers[1].write(msg.String("stop"))
+    with closing(Bridge(load_setup(robot_file(tmp_path)))) as bridge:
+        for errands in (bridge._asking, bridge._stopping):
+            errands.add = lambda _, request: requests.append(request)
+        thread = threading.Thread(target=bridge.run, args=(ended.is_set,))
+        thread.start()
+        deadline = time.monotonic() + 20.0
+        while not requests and time.monotonic() < deadline:
+            time.sleep(0.01)
+        ended.set()
+        thread.join()
+    assert set(requests) == {"estop"}
+
+
 def test_over_dds_a_message_counts_once_also_if_its_publisher_has_gone():
     number, unread = 202 + os.getpid() % 8 * 4, UnreadCounts()
     _domain, participant = Domain(number, msg.LOOPBACK), DomainParticipant(number)

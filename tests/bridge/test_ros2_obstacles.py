@@ -97,6 +97,64 @@ def test_what_is_no_obstacle_is_refused_by_its_reason_and_others_are_still_taken
     assert len(received(array(obstacle()), inlet)) == 1
 
 
+def names(message, inlet, **how):
+    """Return the names that a message reports, and those that it removes."""
+    found = received(message, inlet, **how)
+    return [one.name for one in found if not one.removed], [one.name for one in found if one.removed]
+
+
+def test_obstacles_with_equal_ids_are_all_kept_and_those_of_the_array_before_removed():
+    """costmap_converter leaves the id 0, or writes -1: each array holds all that its sender sees."""
+    inlet = ObstacleInlet("map")
+    three = [obstacle((float(k), 0.0), number=0) for k in range(3)]
+    found = received(array(*three, obstacle(number=-1), obstacle(number=-1)), inlet)
+    assert [one.name for one in found] == ["ros2.0", "ros2.0.2", "ros2.0.3", "ros2.-1", "ros2.-1.2"]
+    assert [one.x_m for one in found[:3]] == [0.0, 1.0, 2.0]
+    assert names(array(*three[:2], obstacle(number=-1)), inlet) == (
+        ["ros2.0", "ros2.0.2", "ros2.-1"],
+        ["ros2.0.3", "ros2.-1.2"],
+    )
+    reported, removed = names(array(), inlet)
+    assert reported == []
+    # Removals are repeated, as a datagram can be lost, and the one that is missing again is among them.
+    assert removed == ["ros2.0", "ros2.0.2", "ros2.0.3", "ros2.-1", "ros2.-1.2"]
+    assert inlet.passed == 8
+    late_ns = WALL_NS + 3_000_000_000
+    later = msg.ObstacleArrayMsg(msg.Header(msg.stamp_of(late_ns), "map"), [])
+    assert len(inlet.datagrams(later, late_ns, late_ns)) == 5
+    assert inlet.datagrams(later, late_ns, late_ns) == []
+
+
+def test_a_track_that_is_missing_from_an_array_is_not_removed():
+    """Its sender says which obstacle it is: where it went nobody knows, and the robot stops."""
+    inlet = ObstacleInlet("map")
+    received(array(obstacle(number=7), obstacle(number=8)), inlet)
+    assert names(array(obstacle(number=8)), inlet) == (["ros2.8"], [])
+    # Several of one positive id are no tracks.
+    received(array(obstacle(number=9), obstacle(number=9)), inlet)
+    assert names(array(obstacle(number=9)), inlet) == (["ros2.9"], ["ros2.9.2"])
+    assert names(array(), inlet)[1] == ["ros2.9", "ros2.9.2"]
+
+
+@pytest.mark.parametrize(
+    "partial",
+    [array(obstacle(number=0), obstacle(number=0, frame="odom")), array(frame="odom"), array(age_ns=1001 * MS),
+     array(*(obstacle(number=k + 1) for k in range(MOST_OBSTACLES)), *[obstacle(number=0)] * 3)],
+)  # fmt: skip
+def test_an_array_that_is_refused_or_another_publishers_removes_none(partial):
+    inlet = ObstacleInlet("map")
+    received(array(*[obstacle(number=0)] * 3), inlet)
+    assert names(partial, inlet)[1] == []
+    whole = array(obstacle(number=0))
+    assert inlet.datagrams(whole, WALL_NS, WALL_NS, publisher="another")[1:] == []
+
+
+def test_an_array_without_a_frame_is_refused_with_what_to_do():
+    inlet = ObstacleInlet("map")
+    received(array(obstacle(), frame=""), inlet)
+    assert list(inlet.refused) == ['in frame "", not "map"; have the sender fill in header.frame_id']
+
+
 def test_an_obstacle_without_points_is_none():
     without_points = array(msg.ObstacleMsg(radius=1.0), obstacle(number=8))
     assert [one.name for one in received(without_points)] == ["ros2.8"]

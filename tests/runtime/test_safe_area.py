@@ -308,6 +308,22 @@ def test_a_person_adds_and_removes_obstacles_and_all_is_recorded():
             area.handle_request(8, wrong)
 
 
+def test_an_obstacle_whose_sender_says_that_it_is_gone_does_not_stop_the_robot():
+    area = area_of(Fence(keep_in=ROOM))
+    for name in ("box", "cart"):
+        area.report(0, report(name))
+    gone = report_from(BOX | {"removed": True})
+    area.report(SECOND_NS // 2, gone)
+    # A sender may repeat it, or mean one that was never reported.
+    area.report(SECOND_NS // 2, gone)
+    area.begin(2 * SECOND_NS, by_hand=False)
+    assert area.obstacles.lost == ("cart",)
+    _, written = area.end(2 * SECOND_NS, area.last, overridden=False)
+    assert [(one.name, one.removed) for one in written] == [("box", False), ("cart", False), ("box", True)]
+    with pytest.raises(ObstacleRefused, match="write add or remove"):
+        area.handle_request(0, {"change": "add", **BOX, "removed": True})
+
+
 def test_the_fence_is_changed_while_disarmed_only():
     area = area_of(Fence(keep_in=ROOM))
     for state in (State.ARMED, State.STOPPING):

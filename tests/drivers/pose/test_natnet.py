@@ -201,6 +201,27 @@ def test_by_unicast_it_asks_and_takes_version_and_clock_from_the_answer(create_s
         source.close()
 
 
+def test_a_server_of_a_newer_version_is_named_once_while_its_frames_are_read(create_source, port):
+    version = (3, 0)
+    source = create_source("natnet", data_port=port, server="127.0.0.1", body=3)
+
+    def about(*newer):
+        text = b"Motive".ljust(256, b"\0") + bytes([9, 9, 0, 0, *newer, 0, 0]) + struct.pack("<Q", TEN_MHZ)
+        return struct.pack("<HH", 1, len(text)) + text
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        for answer in (*[about(9, 0)] * 5, about(9, 1)):
+            server.sendto(frame(version, [rigid_body(version)]), ("127.0.0.1", port))
+            server.sendto(answer, ("127.0.0.1", port))
+        _, messages = receive_until(source, lambda _, messages: any("9.1" in text for text in messages))
+    supported = ", ".join(VERSIONS)
+    assert messages == [
+        "rigid body 3 is tracked",
+        f"the server uses NatNet 9.0, supported are {supported}",
+        f"the server uses NatNet 9.1, supported are {supported}",
+    ]
+
+
 def test_an_address_that_is_not_this_computers_is_one_line():
     with pytest.raises(PoseSourceError, match=r"correct pose\.group, pose\.server, or pose\.address"):
         create_pose_source("natnet", address="203.0.113.7")

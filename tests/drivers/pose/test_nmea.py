@@ -1,5 +1,6 @@
 """A GPS receiver: the vendors' own sentences, a library's, a real port and a real socket, and a reader killed."""
 
+import itertools
 import json
 import math
 import os
@@ -8,13 +9,14 @@ import socket
 import subprocess
 import time
 import tty
+from contextlib import ExitStack, suppress
 from datetime import UTC, datetime, timedelta
 
 import pytest
 
 from disco_hw.runtime.pipeline import NoPlanner
 from drivers.pose import PoseSourceError, create_pose_source
-from drivers.pose.nmea import QUALITY_STD_M, Fixes, NmeaPoses, ReceiverClock, TangentPlane
+from drivers.pose.nmea import QUALITY_STD_M, Fixes, NmeaPoses, ReceiverClock, TangentPlane, _lines
 from tests.drivers.waiting import receive_until
 from tests.runtime.simulated import simulated_stack
 
@@ -180,6 +182,46 @@ def test_a_heading_goes_with_the_position_of_the_same_burst(order):
     assert "yaw_rad" not in bare
 
 
+def epochs(position_hz, heading_hz, heading_ms, seconds=2):
+    """Return the poses of a receiver whose headings, 1 degree per 10 ms, come `heading_ms` after their positions."""
+    fixes, lines = Fixes(), []
+    for k in range(position_hz * seconds):
+        at_ms = 1000 * k // position_hz
+        lines.append((at_ms, gga(at_ms / 1000, 47.0, 8.0)))
+        if k % (position_hz // heading_hz) == 0:
+            lines.append((at_ms + heading_ms, sentence(f"GNHDT,{at_ms / 10:.1f},T")))
+    found = []
+    for at_ms, line in sorted(lines):
+        found += fixes.add_line(line, NOW_NS + at_ms * 1_000_000)
+    return poses(found + fixes.flush(NOW_NS + 10**10))
+
+
+@pytest.mark.parametrize(
+    ("position_hz", "heading_hz", "heading_ms"),
+    [(20, 1, 2), (20, 5, 2), (20, 20, 2), (10, 10, 2), (10, 10, 45), (10, 10, -10), (20, 20, -10), (5, 1, 30)],
+)  # fmt: skip
+def test_no_position_is_lost_and_each_heading_goes_with_the_position_of_its_epoch(position_hz, heading_hz, heading_ms):
+    found = epochs(position_hz, heading_hz, heading_ms)
+    at_s = [round((pose["t_ns"] - found[0]["t_ns"]) * 1e-9, 3) for pose in found]
+    assert at_s == [k / position_hz for k in range(2 * position_hz)]
+    with_heading = {at: pose["yaw_rad"] for at, pose in zip(at_s, found, strict=True) if "yaw_rad" in pose}
+    # The first position does not wait, as no heading was seen yet.
+    assert len(with_heading) >= 2 * heading_hz - 1
+    for at, yaw_rad in with_heading.items():
+        assert math.remainder(yaw_rad - math.radians(90.0 - 100.0 * at), math.tau) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_lost_heading_does_not_shift_those_after_it():
+    fixes, found = Fixes(), []
+    for k in range(20):
+        at_ms = 50 * k
+        if k != 8:
+            found += fixes.add_line(sentence(f"GNHDT,{k}.0,T"), NOW_NS + (at_ms - 10) * 1_000_000)
+        found += fixes.add_line(gga(at_ms / 1000, 47.0, 8.0), NOW_NS + at_ms * 1_000_000)
+    headings = [pose.get("yaw_rad") for pose in poses(found + fixes.flush(NOW_NS + 10**10))]
+    assert headings == pytest.approx([None if k == 8 else math.radians(90.0 - k) for k in range(20)], abs=1e-9)
+
+
 def test_a_fix_has_the_receivers_time_and_not_the_moods_of_the_line():
     clock = ReceiverClock()
     delays_s = [0.15, 0.05, 0.30, 0.05, 0.80, 0.06]
@@ -270,6 +312,73 @@ def test_over_tcp_with_a_server_that_comes_late_and_sends_garbage(create_source)
             again.sendall(gga(40_000.0, 47.0, 8.5))
             (pose,), _ = receive_until(source, lambda found, _: found)
             assert (pose.x_m, pose.y_m) == pytest.approx((0.0, 0.0), abs=1e-3)
+
+
+def test_a_binary_block_before_a_sentence_costs_no_position(create_source):
+    """Receivers mix UBX, SBF or RTCM with NMEA; those end with no newline, and may hold a dollar sign."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        source = create_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
+        receiver, _ = server.accept()
+        opened(source)
+        with receiver:
+            for k in range(5):
+                receiver.sendall(b"\xb5\x62\x01$\x07" + bytes(range(128, 228)) + gga(0.2 * k, 47.0, 8.5))
+            found, _ = receive_until(source, lambda found, _: len(found) == 5)
+    assert len(found) == 5
+
+
+def test_binary_data_alone_is_no_sentence(monkeypatch):
+    monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.05)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    for _, text in _lines(os.ttyname(slave), 115_200):
+        if text is None:
+            os.write(master, b"\xb5$\x07\x01\x02\n")
+        elif "no NMEA sentence" in text:
+            break
+    os.close(slave)
+    os.close(master)
+
+
+def test_over_tcp_a_receiver_that_falls_silent_is_connected_to_again(monkeypatch):
+    """One that lost its power says nothing, and knows nothing of its old connection afterwards."""
+    monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.1)
+    monkeypatch.setattr("drivers.pose.nmea._RETRY_S", (0.0,))
+    with socket.create_server(("127.0.0.1", 0)) as server, ExitStack() as connections:
+        device = f"socket://127.0.0.1:{server.getsockname()[1]}"
+        lines = _lines(device, 115_200)
+        assert next(lines) == (b"", f"{device}: open")
+        connections.enter_context(server.accept()[0])
+        (text,) = messages_until(lines, 1)
+        assert text == f"{device}: no NMEA sentence for 0 s; connecting again; check the receiver"
+        server.setblocking(False)
+        for _, text in lines:
+            with suppress(BlockingIOError):
+                connections.enter_context(server.accept()[0]).sendall(GGA_ALONE)
+            if text is not None:
+                break
+        assert text == f"{device}: NMEA sentences received again"
+
+
+def test_a_serial_port_that_falls_silent_stays_open(monkeypatch):
+    monkeypatch.setattr("drivers.pose.nmea._SILENT_S", 0.05)
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    lines = _lines(os.ttyname(slave), 115_200)
+    next(lines)
+    (text,) = messages_until(lines, 1)
+    assert text.endswith(": no NMEA sentence for 0 s; check the receiver and pose.baud")
+    # Were it opened again, this would be thrown away.
+    os.write(master, GGA_ALONE)
+    assert messages_until(lines, 1)[0].endswith(": NMEA sentences received again")
+    assert messages_until(lines, 1)[0].endswith(": no NMEA sentence for 0 s; check the receiver and pose.baud")
+    os.close(slave)
+    os.close(master)
+
+
+def messages_until(lines, count):
+    """Return the next messages of the port's reader; what it reads is left out."""
+    return list(itertools.islice((text for _, text in itertools.islice(lines, 1000) if text is not None), count))
 
 
 def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(create_source):
@@ -390,3 +499,16 @@ def test_where_no_heading_comes_the_sentences_that_bring_one_are_named_once():
     assert len(messages_over(30)) == 1
     assert messages_over(9) == []
     assert messages_over(30, HDT) == []
+
+
+@pytest.mark.parametrize("heading", [HDT, sentence("GNTHS,123.4,A")], ids=["HDT", "THS"])
+def test_each_loss_of_the_heading_is_reported_and_its_return(heading):
+    fixes, found = Fixes(), []
+    for k in range(5 * 60):
+        at_ns = NOW_NS + 200_000_000 * k
+        found += fixes.add_line(fix(4), at_ns)
+        # It comes for 10 s, is away for 20 s, and comes for 5 s; then it stays away.
+        if k < 50 or 150 <= k < 175:
+            found += fixes.add_line(heading, at_ns + 1_000_000)
+    lost, back = "no heading for 10 s; positions only", "headings received again"
+    assert [message for message in messages_of(found) if "heading" in message] == [lost, back, lost]
