@@ -51,7 +51,7 @@ _INTERFACE_UP_FLAG = 0x1
 # Chosen: longer than a server of the local network takes to answer; a connection that fails is tried again.
 _PROBE_TIMEOUT_S = 1.0
 _ECHO_OPTION = "receive_own_messages"
-_ECHOING_INTERFACES = frozenset({"udp_multicast"})
+_ECHOING_INTERFACES = frozenset({"udp_multicast", "gs_usb"})
 SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
 MAY_STAY_MUTE = frozenset({"slcan", "serial", "seeedstudio", "robotell", "socketcand"})
 """Interfaces over a serial port or a connection: these can be open and lead nowhere."""

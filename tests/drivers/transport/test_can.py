@@ -220,10 +220,15 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
 MULTICAST_GROUP = "ff11::6469:7363"
 
 
-@pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
-def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(interface):
+@pytest.mark.parametrize("interface", ["virtual", "udp_multicast", "gs_usb"])
+def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(interface, monkeypatch):
     if interface == "virtual":
         channel, options, own = next(CHANNELS), {}, {"receive_own_messages": True}
+    elif interface == "gs_usb":
+        # In place of an adapter, whose firmware echoes each frame that the host sends.
+        channel, options, own, open_bus = next(CHANNELS), {}, {}, can.Bus
+        echoing = {"interface": "virtual", "receive_own_messages": True}
+        monkeypatch.setattr(can, "Bus", lambda **settings: open_bus(**settings | echoing))
     else:
         # A free port, so that runs side by side do not hear each other.
         channel, options, own = MULTICAST_GROUP, {"port": free_port(socket.SOCK_DGRAM), "hop_limit": 0}, {}
