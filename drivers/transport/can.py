@@ -40,7 +40,6 @@ _CONTROLLER_ERRORS, _RECEIVE_OVERFLOW = 0x3F, 0x01
 ECHO_NS = 1_000_000_000
 # Of a bus whose library or system is not here; where a library was not loaded, some of python-can use it all the same.
 _NOT_HERE = (can.CanInterfaceNotImplementedError, ImportError, NameError)
-_OVER_A_TTY = ("slcan", "serial", "seeedstudio", "robotell")
 KIND = "can"
 # Chosen: longer than a frame waits for the reading thread, and shorter than most steps of a clock.
 MAX_STAMP_AGE_S = 1.0
@@ -53,7 +52,9 @@ _PROBE_TIMEOUT_S = 1.0
 _ECHO_OPTION = "receive_own_messages"
 _ECHOING_INTERFACES = frozenset({"udp_multicast", "gs_usb"})
 SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
-MAY_STAY_MUTE = frozenset({"slcan", "serial", "seeedstudio", "robotell", "socketcand"})
+OVER_A_TTY = frozenset({"slcan", "serial", "seeedstudio", "robotell"})
+"""Interfaces over a serial port: who closes one of two openings may close the adapter's CAN channel for both."""
+MAY_STAY_MUTE = OVER_A_TTY | {"socketcand"}
 """Interfaces over a serial port or a connection: these can be open and lead nowhere."""
 _NAMED_FIELDS = ("interface", "channel", "bitrate", "ignore_config")
 _NEEDED_OPTIONS = {"socketcand": ("host", "port")}
@@ -167,7 +168,7 @@ class CanMedium:
             text = "libusb is missing; run: sudo apt-get install libusb-1.0-0"
         elif self.interface == "socketcan" and number in (hints := self._socketcan_hints()):
             text = hints[number]
-        elif self.interface in _OVER_A_TTY and number is not None:
+        elif self.interface in OVER_A_TTY and number is not None:
             return explain_port(self.channel, error)
         elif number in (errno.ENOENT, errno.ECONNREFUSED):
             text = "nothing listens there; start the other end first"

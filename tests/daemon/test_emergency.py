@@ -221,6 +221,27 @@ def test_a_line_of_one_request_at_a_time_is_left_to_a_daemon_that_lives_and_take
     assert os.read(robot_end, 4096)
 
 
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_beside_another(
+    tmp_path, daemon, line, monkeypatch, confirmed
+):
+    """To close a second opening closes the adapter's channel under the daemon."""
+    robot_end, host_end = line
+    tty.setraw(host_end)
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
+    if confirmed:
+        daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
+    channel = {"/tmp/disco-hw-wombot.can": os.ttyname(host_end)}
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link='interface = "slcan"', **channel))
+    assert (daemon.actions()[0], outcome.sent, outcome.confirmed) == ("estop", True, confirmed)
+    if confirmed:
+        assert "left to the daemon" in outcome.link_error
+        assert not select.select([robot_end], [], [], 0.0)[0], "nobody else opens the adapter"
+    else:
+        assert outcome.link_error is None
+        assert b"\rt080" in os.read(robot_end, 4096)
+
+
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
 def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path, option):
     with pytest.raises(InputError, match=f"--link {option}: .*write can, serial, can:INTERFACE:CHANNEL or serial:PORT"):
