@@ -185,7 +185,8 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
 
 
 def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmation: Callable[[Frame], bool]) -> bool:
-    transport = open_transport(**settings.medium_fields())
+    # Not exclusive: a daemon that hangs may hold the adapter, and must not be able to keep the stop from the robot.
+    transport = open_transport(**settings.medium_fields(), exclusive=False)
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
         while transport.state is not LinkState.UP:

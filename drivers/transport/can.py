@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
+import os
 import socket
 import threading
 import time
@@ -74,9 +77,10 @@ def create_transport(
     channel: str = "can0",
     bitrate: int = 500_000,
     options: Mapping[str, Any] = MappingProxyType({}),
+    exclusive: bool = True,
     **_of_other_media: Any,
 ) -> ReconnectingTransport:
-    """Make a link over a CAN bus by the fields of robot.toml's [link].
+    """Make a link over a CAN bus by the fields of robot.toml's [link]; `exclusive` as `CanMedium` has it.
 
     Raises TransportSettingsError for an interface, option or bit rate (bit/s) that does not exist, and for an interface
     whose Python package is not installed.
@@ -84,7 +88,7 @@ def create_transport(
     _check_can(interface, bitrate, options)
     mute_after_s = MUTE_AFTER_S if interface in MAY_STAY_MUTE else None
     return ReconnectingTransport(
-        CanMedium(interface, channel, bitrate, options), mute_after_s=mute_after_s, carries_extended=True
+        CanMedium(interface, channel, bitrate, options, exclusive), mute_after_s=mute_after_s, carries_extended=True
     )
 
 
@@ -117,13 +121,14 @@ class CanMedium:
     """A CAN bus by python-can's interface name: "socketcan", "slcan", "unixcan", "virtual" and all others.
 
     `bitrate` is in bit/s; a socketcan interface has its own, set by `ip link`. `options` go to the python-can interface
-    as they are.
+    as they are. `exclusive`: whether an adapter behind a serial port is opened for this process alone.
     """
 
     interface: str
     channel: str
     bitrate: int
     options: Mapping[str, Any] = field(default_factory=dict)
+    exclusive: bool = True
 
     @property
     def name(self) -> str:
@@ -146,10 +151,13 @@ class CanMedium:
         options |= self.options
         if self.interface == "socketcand":
             require_server(str(options["host"]), int(options["port"]))
-        # Without ignore_config a file in the user's home could change what is opened.
-        bus = can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
         echoes = self.interface in _ECHOING_INTERFACES or bool(self.options.get(_ECHO_OPTION))
-        return CanConnection(bus, counters, SentFrames() if echoes else None)
+        with contextlib.ExitStack() as held:
+            if self.exclusive and self.interface in OVER_A_TTY and "://" not in self.channel:
+                held.callback(os.close, lock_port(self.channel))
+            # Without ignore_config a file in the user's home could change what is opened.
+            bus = can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
+            return CanConnection(bus, counters, SentFrames() if echoes else None, held.pop_all())
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
@@ -196,11 +204,21 @@ class CanConnection:
     Whether a frame "is_rx" is not asked: on a virtual CAN every frame of another local process says it is not.
     """
 
-    def __init__(self, bus: can.BusABC, counters: TransportCounters, sent_frames: SentFrames | None = None) -> None:
-        """Wrap an open bus; `sent_frames` is for a bus that returns a sender's own frames, which are then dropped."""
+    def __init__(
+        self,
+        bus: can.BusABC,
+        counters: TransportCounters,
+        sent_frames: SentFrames | None = None,
+        held: contextlib.ExitStack | None = None,
+    ) -> None:
+        """Wrap an open bus; `sent_frames` is for a bus that returns a sender's own frames, which are then dropped.
+
+        `held` is closed with the bus.
+        """
         self._bus = bus
         self._counters = counters
         self._sent_frames = sent_frames
+        self._held = held or contextlib.ExitStack()
         self._garbage = 0
 
     def read(self) -> Sequence[ReceivedFrame]:
@@ -254,13 +272,14 @@ class CanConnection:
 
     def close(self) -> None:
         """Shut the bus down; may raise what python-can raises on a device that is gone."""
-        try:
-            self._bus.shutdown()
-        finally:
-            # slcan gives up before it closes the port, and a tty still held comes back under another name.
-            port = getattr(self._bus, "serialPortOrig", None)
-            if port is not None:
-                port.close()
+        with self._held:
+            try:
+                self._bus.shutdown()
+            finally:
+                # slcan gives up before it closes the port, and a tty still held comes back under another name.
+                port = getattr(self._bus, "serialPortOrig", None)
+                if port is not None:
+                    port.close()
 
     def _handle_garbage(self, error: Exception) -> None:
         flush = getattr(self._bus, "flush", None)
@@ -305,6 +324,21 @@ def is_busy(error: Exception) -> bool:
             return True
         seen = seen.__cause__
     return False
+
+
+def lock_port(channel: str) -> int:
+    """Lock the serial port of a python-can channel (PORT or PORT@BAUD) as pyserial does, and return a descriptor of it.
+
+    python-can has no such option, and a second link would write to the adapter before it could lock the port itself.
+    Raises OSError where the port is absent or locked.
+    """
+    port = os.open(channel.partition("@")[0], os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(port, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(port)
+        raise
+    return port
 
 
 def require_server(host: str, port: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import select
@@ -228,6 +229,8 @@ def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_be
     """To close a second opening closes the adapter's channel under the daemon."""
     robot_end, host_end = line
     tty.setraw(host_end)
+    # As the daemon's own link has it.
+    fcntl.flock(host_end, fcntl.LOCK_EX)
     monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
     if confirmed:
         daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}

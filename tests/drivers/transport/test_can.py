@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 
 import can
 import can.interfaces.virtual as virtual_bus
@@ -193,8 +194,9 @@ def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
         assert [received.frame.can_id for received in collect(transport, 1)] == [0x111]
 
 
-def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch):
-    requested = []
+def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch, tmp_path):
+    requested, port = [], str(tmp_path / "x")
+    Path(port).touch()
 
     def refuse(**settings):
         requested.append(settings)
@@ -203,12 +205,12 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
     monkeypatch.setattr(can, "Bus", refuse)
     for medium in (
         CanMedium("virtual", "one", 250_000, {"rx_queue_size": 7}),
-        CanMedium("slcan", "/dev/x", 125_000),
-        CanMedium("slcan", "/dev/x", 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
+        CanMedium("slcan", port, 125_000),
+        CanMedium("slcan", port, 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
     ):
         with pytest.raises(OSError, match="not here"):
             medium.connect(TransportCounters())
-    plain = {"interface": "slcan", "channel": "/dev/x", "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
+    plain = {"interface": "slcan", "channel": port, "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
     assert requested == [
         {"interface": "virtual", "channel": "one", "ignore_config": True, "bitrate": 250_000, "rx_queue_size": 7},
         {**plain, "sleep_after_open": 0.0},
@@ -447,6 +449,17 @@ def test_slcan_adapter_unplugged_and_plugged_in_again_leaks_nothing(slcan, termi
         terminal.write(b"t110101\r")
         assert collect(slcan, 1)[-1].frame == Frame(0x110, b"\x01")
     wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
+
+
+def test_slcan_adapter_in_use_takes_no_second_link_which_writes_nothing_to_it(slcan, terminal):
+    written = bytes(terminal.received)
+    with opened_bus("slcan", f"{terminal.path}@9600") as second:
+        wait_until(lambda: second.last_error)
+        assert "in use by another program" in second.last_error
+    assert terminal.received == written
+    with opened(CanMedium("slcan", str(terminal.path), 500_000, exclusive=False)) as stop:
+        up(stop)
+    assert slcan.generation == 1
 
 
 def test_slcan_adapter_that_reads_nothing_blocks_nobody_and_frames_expire(slcan, terminal):
