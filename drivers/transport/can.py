@@ -60,6 +60,7 @@ OVER_A_TTY = frozenset({"slcan", "serial", "seeedstudio", "robotell"})
 MAY_STAY_MUTE = OVER_A_TTY | {"socketcand"}
 """Interfaces over a serial port or a connection: these can be open and lead nowhere."""
 _NAMED_FIELDS = ("interface", "channel", "bitrate", "ignore_config")
+_GS_USB_DEVICE = {"index", "bus", "address"}
 _NEEDED_OPTIONS = {"socketcand": ("host", "port")}
 _PACKAGES = {
     "canalystii": ("canalystii", "canalystii"),
@@ -148,6 +149,9 @@ class CanMedium:
         if self.interface == "slcan":
             # Its default is two seconds for boards that restart when the port opens; it polls at 1 kHz as well.
             options |= {"sleep_after_open": 0.0, "timeout": READ_TIMEOUT_S}
+        if self.interface == "gs_usb" and self.channel.isdecimal() and not _GS_USB_DEVICE & self.options.keys():
+            # python-can counts the adapters by the channel only if that is no text.
+            options["index"] = int(self.channel)
         options |= self.options
         if self.interface == "socketcand":
             require_server(str(options["host"]), int(options["port"]))

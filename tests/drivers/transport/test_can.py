@@ -207,14 +207,19 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
         CanMedium("virtual", "one", 250_000, {"rx_queue_size": 7}),
         CanMedium("slcan", port, 125_000),
         CanMedium("slcan", port, 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
+        CanMedium("gs_usb", "1", 125_000),
+        CanMedium("gs_usb", "1", 125_000, {"bus": 1, "address": 2}),
     ):
         with pytest.raises(OSError, match="not here"):
             medium.connect(TransportCounters())
     plain = {"interface": "slcan", "channel": port, "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
+    usb = {"interface": "gs_usb", "channel": "1", "ignore_config": True, "bitrate": 125_000}
     assert requested == [
         {"interface": "virtual", "channel": "one", "ignore_config": True, "bitrate": 250_000, "rx_queue_size": 7},
         {**plain, "sleep_after_open": 0.0},
         {**plain, "sleep_after_open": 2.0, "tty_baudrate": 9600},
+        {**usb, "index": 1},
+        {**usb, "bus": 1, "address": 2},
     ]
 
 
