@@ -346,8 +346,15 @@ def lock_port(channel: str) -> int:
 
 
 def require_server(host: str, port: int) -> None:
-    """Raise OSError where nothing listens; python-can would try again without a pause for ten seconds."""
-    socket.create_connection((host, port), _PROBE_TIMEOUT_S).close()
+    """Raise OSError where nothing listens, LinkLostError where a server sends no greeting.
+
+    python-can would try again without a pause for ten seconds, and would wait for the greeting without end.
+    """
+    with socket.create_connection((host, port), _PROBE_TIMEOUT_S) as probe:
+        try:
+            probe.recv(64)
+        except TimeoutError:
+            raise LinkLostError("the server sends no greeting; restart it, or correct host and port") from None
 
 
 def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")) -> None:

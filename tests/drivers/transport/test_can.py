@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.transport import can as can_transport
 from drivers.transport.can import (
     ECHO_NS,
     GARBAGE_LIMIT,
@@ -341,6 +342,16 @@ def test_socketcand_by_host_and_port_from_the_options():
 
         wait_until(is_connecting)
         wait_until(lambda: "start the other end first" in (transport.last_error or ""))
+
+
+def test_a_socketcand_server_that_says_nothing_is_named_and_tried_again(monkeypatch):
+    monkeypatch.setattr(can_transport, "_PROBE_TIMEOUT_S", 0.05)
+    # The system accepts for it.
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with opened_bus("socketcand", "can7", host="127.0.0.1", port=port) as transport:
+            wait_until(lambda: transport.last_error, timeout_s=2.0)
+            assert "sends no greeting" in transport.last_error
 
 
 def test_a_bus_over_a_port_that_stays_mute_is_opened_again(terminal):
