@@ -233,8 +233,9 @@ class CanConnection:
             self._handle_garbage(error)
             return ()
         except can.CanError as error:
-            # slcan: a byte that is no text makes every later call fail until the buffer is flushed.
-            if not isinstance(error.__cause__, ValueError):
+            # slcan: a byte that is no text makes every later call fail until the buffer is flushed. udp_multicast: what
+            # is no frame fails in one of these ways.
+            if not isinstance(error.__cause__, (ValueError, TypeError, AttributeError)):
                 raise
             self._handle_garbage(error)
             return ()

@@ -254,6 +254,20 @@ def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(inte
         assert got == [(0x100, b"\4"), (0x111, b"\x01\x02")]
 
 
+def test_datagrams_that_are_no_frames_are_counted_and_do_not_cost_the_session():
+    port = free_port(socket.SOCK_DGRAM)
+    with (
+        opened_bus("udp_multicast", MULTICAST_GROUP, port=port, hop_limit=0) as transport,
+        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as stranger,
+    ):
+        up(transport)
+        # In msgpack a number, more than one value, {"a": 1} and {"dlc": "a"}.
+        for number, datagram in enumerate((b"\x01", b"hello", b"\x81\xa1a\x01", b"\x81\xa3dlc\xa1a"), 1):
+            stranger.sendto(datagram, (MULTICAST_GROUP, port))
+            wait_until(lambda: transport.stats.malformed == number, timeout_s=2.0)  # noqa: B023
+        assert transport.generation == 1
+
+
 def test_a_frame_that_found_no_room_excuses_no_other_hosts():
     class Full:
         def send(self, message, timeout):
