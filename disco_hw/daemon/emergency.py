@@ -1,8 +1,9 @@
 """Stop the robot from outside, with as little as possible in the way.
 
 The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked as well; each
-way is tried whether or not the other worked. A robot.toml whose other sections are broken still says where the link is;
-without one that can be read, the option --link does.
+way is tried whether or not the other worked. Only where the two would disturb each other is the daemon asked first, and
+the link is left to it if that stops the robot. A robot.toml whose other sections are broken still says where the link
+is; without one that can be read, the option --link does.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from disco_hw.reports import as_json as json_of
 from drivers.motor import find_driver
 from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.transport import SerialMedium, open_transport
+from drivers.transport.can import OVER_A_TTY
 from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
@@ -121,15 +123,17 @@ def stop_robot(robot: Path, link: str | None = None, kept: Mapping[str, Any] | N
     driver = find_driver(settings.driver)
     frames, is_confirmation = driver.stop_frames(settings.settings()), driver.stop_confirmation(settings.settings())
     is_serial = settings.kind == "serial"
-    way = _stop_over_serial if is_serial else _stop_over_transport
+    is_exchange = is_serial and driver.exchange is not None
+    way = _stop_over_exchange if is_exchange else _stop_over_serial if is_serial else _stop_over_transport
     address = settings.port if is_serial else f"{settings.interface} {settings.channel}"
     outcome = EstopOutcome(address, None, None, False, refused, file_error, driver.latches_stop)
-    if is_serial and driver.exchange is not None:
-        # Two that speak at once on such a line spoil each other's packets: the daemon first, which has it.
+    if is_exchange or (not is_serial and settings.interface in OVER_A_TTY):
+        # Two that speak at once on a line of exchanges spoil each other's packets, and a second opening of an adapter
+        # closes its CAN channel under the daemon when it ends: the daemon first, which has the line.
         daemon_confirmed, daemon_error = _request_stop(socket_path)
-        if daemon_error is None:
+        if daemon_confirmed or (is_exchange and daemon_error is None):
             return replace(outcome, link_error="left to the daemon, which holds the line", confirmed=daemon_confirmed)
-        confirmed, link_error = _attempt(partial(_stop_over_exchange, settings, frames, is_confirmation))
+        confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
     else:
         confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
         daemon_confirmed, daemon_error = _request_stop(socket_path)
@@ -182,7 +186,8 @@ def _socket_path(raw: dict[str, Any]) -> Path | None:
 
 
 def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
-    transport = open_transport(**settings.medium_fields())
+    # Not exclusive: a daemon that hangs may hold the adapter, and must not be able to keep the stop from the robot.
+    transport = open_transport(**settings.medium_fields(), exclusive=False)
     try:
         deadline_ns = time.monotonic_ns() + round(_CONNECT_S * 1e9)
         while transport.state is not LinkState.UP:

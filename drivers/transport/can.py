@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
+import os
 import socket
 import threading
 import time
@@ -40,7 +43,6 @@ _CONTROLLER_ERRORS, _RECEIVE_OVERFLOW = 0x3F, 0x01
 ECHO_NS = 1_000_000_000
 # Of a bus whose library or system is not here; where a library was not loaded, some of python-can use it all the same.
 _NOT_HERE = (can.CanInterfaceNotImplementedError, ImportError, NameError)
-_OVER_A_TTY = ("slcan", "serial", "seeedstudio", "robotell")
 KIND = "can"
 # Chosen: longer than a frame waits for the reading thread, and shorter than most steps of a clock.
 MAX_STAMP_AGE_S = 1.0
@@ -51,11 +53,14 @@ _INTERFACE_UP_FLAG = 0x1
 # Chosen: longer than a server of the local network takes to answer; a connection that fails is tried again.
 _PROBE_TIMEOUT_S = 1.0
 _ECHO_OPTION = "receive_own_messages"
-_ECHOING_INTERFACES = frozenset({"udp_multicast"})
+_ECHOING_INTERFACES = frozenset({"udp_multicast", "gs_usb"})
 SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
-MAY_STAY_MUTE = frozenset({"slcan", "serial", "seeedstudio", "robotell", "socketcand"})
+OVER_A_TTY = frozenset({"slcan", "serial", "seeedstudio", "robotell"})
+"""Interfaces over a serial port: who closes one of two openings may close the adapter's CAN channel for both."""
+MAY_STAY_MUTE = OVER_A_TTY | {"socketcand"}
 """Interfaces over a serial port or a connection: these can be open and lead nowhere."""
 _NAMED_FIELDS = ("interface", "channel", "bitrate", "ignore_config")
+_GS_USB_DEVICE = {"index", "bus", "address"}
 _NEEDED_OPTIONS = {"socketcand": ("host", "port")}
 _PACKAGES = {
     "canalystii": ("canalystii", "canalystii"),
@@ -73,9 +78,10 @@ def create_transport(
     channel: str = "can0",
     bitrate: int = 500_000,
     options: Mapping[str, Any] = MappingProxyType({}),
+    exclusive: bool = True,
     **_of_other_media: Any,
 ) -> ReconnectingTransport:
-    """Make a link over a CAN bus by the fields of robot.toml's [link].
+    """Make a link over a CAN bus by the fields of robot.toml's [link]; `exclusive` as `CanMedium` has it.
 
     Raises TransportSettingsError for an interface, option or bit rate (bit/s) that does not exist, and for an interface
     whose Python package is not installed.
@@ -83,7 +89,7 @@ def create_transport(
     _check_can(interface, bitrate, options)
     mute_after_s = MUTE_AFTER_S if interface in MAY_STAY_MUTE else None
     return ReconnectingTransport(
-        CanMedium(interface, channel, bitrate, options), mute_after_s=mute_after_s, carries_extended=True
+        CanMedium(interface, channel, bitrate, options, exclusive), mute_after_s=mute_after_s, carries_extended=True
     )
 
 
@@ -116,13 +122,14 @@ class CanMedium:
     """A CAN bus by python-can's interface name: "socketcan", "slcan", "unixcan", "virtual" and all others.
 
     `bitrate` is in bit/s; a socketcan interface has its own, set by `ip link`. `options` go to the python-can interface
-    as they are.
+    as they are. `exclusive`: whether an adapter behind a serial port is opened for this process alone.
     """
 
     interface: str
     channel: str
     bitrate: int
     options: Mapping[str, Any] = field(default_factory=dict)
+    exclusive: bool = True
 
     @property
     def name(self) -> str:
@@ -142,13 +149,19 @@ class CanMedium:
         if self.interface == "slcan":
             # Its default is two seconds for boards that restart when the port opens; it polls at 1 kHz as well.
             options |= {"sleep_after_open": 0.0, "timeout": READ_TIMEOUT_S}
+        if self.interface == "gs_usb" and self.channel.isdecimal() and not _GS_USB_DEVICE & self.options.keys():
+            # python-can counts the adapters by the channel only if that is no text.
+            options["index"] = int(self.channel)
         options |= self.options
         if self.interface == "socketcand":
             require_server(str(options["host"]), int(options["port"]))
-        # Without ignore_config a file in the user's home could change what is opened.
-        bus = can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
         echoes = self.interface in _ECHOING_INTERFACES or bool(self.options.get(_ECHO_OPTION))
-        return CanConnection(bus, counters, SentFrames() if echoes else None)
+        with contextlib.ExitStack() as held:
+            if self.exclusive and self.interface in OVER_A_TTY and "://" not in self.channel:
+                held.callback(os.close, lock_port(self.channel))
+            # Without ignore_config a file in the user's home could change what is opened.
+            bus = can.Bus(interface=self.interface, channel=self.channel, ignore_config=True, **options)
+            return CanConnection(bus, counters, SentFrames() if echoes else None, held.pop_all())
 
     def explain(self, error: Exception) -> str:
         """Say in one line what the error means and what to do."""
@@ -167,7 +180,7 @@ class CanMedium:
             text = "libusb is missing; run: sudo apt-get install libusb-1.0-0"
         elif self.interface == "socketcan" and number in (hints := self._socketcan_hints()):
             text = hints[number]
-        elif self.interface in _OVER_A_TTY and number is not None:
+        elif self.interface in OVER_A_TTY and number is not None:
             return explain_port(self.channel, error)
         elif number in (errno.ENOENT, errno.ECONNREFUSED):
             text = "nothing listens there; start the other end first"
@@ -195,11 +208,21 @@ class CanConnection:
     Whether a frame "is_rx" is not asked: on a virtual CAN every frame of another local process says it is not.
     """
 
-    def __init__(self, bus: can.BusABC, counters: TransportCounters, sent_frames: SentFrames | None = None) -> None:
-        """Wrap an open bus; `sent_frames` is for a bus that returns a sender's own frames, which are then dropped."""
+    def __init__(
+        self,
+        bus: can.BusABC,
+        counters: TransportCounters,
+        sent_frames: SentFrames | None = None,
+        held: contextlib.ExitStack | None = None,
+    ) -> None:
+        """Wrap an open bus; `sent_frames` is for a bus that returns a sender's own frames, which are then dropped.
+
+        `held` is closed with the bus.
+        """
         self._bus = bus
         self._counters = counters
         self._sent_frames = sent_frames
+        self._held = held or contextlib.ExitStack()
         self._garbage = 0
 
     def read(self) -> Sequence[ReceivedFrame]:
@@ -210,8 +233,9 @@ class CanConnection:
             self._handle_garbage(error)
             return ()
         except can.CanError as error:
-            # slcan: a byte that is no text makes every later call fail until the buffer is flushed.
-            if not isinstance(error.__cause__, ValueError):
+            # slcan: a byte that is no text makes every later call fail until the buffer is flushed. udp_multicast: what
+            # is no frame fails in one of these ways.
+            if not isinstance(error.__cause__, (ValueError, TypeError, AttributeError)):
                 raise
             self._handle_garbage(error)
             return ()
@@ -253,13 +277,14 @@ class CanConnection:
 
     def close(self) -> None:
         """Shut the bus down; may raise what python-can raises on a device that is gone."""
-        try:
-            self._bus.shutdown()
-        finally:
-            # slcan gives up before it closes the port, and a tty still held comes back under another name.
-            port = getattr(self._bus, "serialPortOrig", None)
-            if port is not None:
-                port.close()
+        with self._held:
+            try:
+                self._bus.shutdown()
+            finally:
+                # slcan gives up before it closes the port, and a tty still held comes back under another name.
+                port = getattr(self._bus, "serialPortOrig", None)
+                if port is not None:
+                    port.close()
 
     def _handle_garbage(self, error: Exception) -> None:
         flush = getattr(self._bus, "flush", None)
@@ -306,9 +331,31 @@ def is_busy(error: Exception) -> bool:
     return False
 
 
+def lock_port(channel: str) -> int:
+    """Lock the serial port of a python-can channel (PORT or PORT@BAUD) as pyserial does, and return a descriptor of it.
+
+    python-can has no such option, and a second link would write to the adapter before it could lock the port itself.
+    Raises OSError where the port is absent or locked.
+    """
+    port = os.open(channel.partition("@")[0], os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(port, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(port)
+        raise
+    return port
+
+
 def require_server(host: str, port: int) -> None:
-    """Raise OSError where nothing listens; python-can would try again without a pause for ten seconds."""
-    socket.create_connection((host, port), _PROBE_TIMEOUT_S).close()
+    """Raise OSError where nothing listens, LinkLostError where a server sends no greeting.
+
+    python-can would try again without a pause for ten seconds, and would wait for the greeting without end.
+    """
+    with socket.create_connection((host, port), _PROBE_TIMEOUT_S) as probe:
+        try:
+            probe.recv(64)
+        except TimeoutError:
+            raise LinkLostError("the server sends no greeting; restart it, or correct host and port") from None
 
 
 def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import select
@@ -219,6 +220,29 @@ def test_a_line_of_one_request_at_a_time_is_left_to_a_daemon_that_lives_and_take
     outcome = stop_robot(robot_file(tmp_path, tmp_path / "none", link=link, **serial))
     assert (outcome.link_error, outcome.sent) == (None, True)
     assert os.read(robot_end, 4096)
+
+
+@pytest.mark.parametrize("confirmed", [True, False])
+def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_beside_another(
+    tmp_path, daemon, line, monkeypatch, confirmed
+):
+    """To close a second opening closes the adapter's channel under the daemon."""
+    robot_end, host_end = line
+    tty.setraw(host_end)
+    # As the daemon's own link has it.
+    fcntl.flock(host_end, fcntl.LOCK_EX)
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
+    if confirmed:
+        daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
+    channel = {"/tmp/disco-hw-wombot.can": os.ttyname(host_end)}
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link='interface = "slcan"', **channel))
+    assert (daemon.actions()[0], outcome.sent, outcome.confirmed) == ("estop", True, confirmed)
+    if confirmed:
+        assert "left to the daemon" in outcome.link_error
+        assert not select.select([robot_end], [], [], 0.0)[0], "nobody else opens the adapter"
+    else:
+        assert outcome.link_error is None
+        assert b"\rt080" in os.read(robot_end, 4096)
 
 
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])

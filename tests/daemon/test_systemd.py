@@ -143,7 +143,8 @@ def test_the_unit_keeps_what_driving_needs():
     assert "RestrictRealtime" not in unit
     assert "MemoryDenyWriteExecute" not in unit
     assert not unit.keys() & {"PrivateDevices", "DevicePolicy", "DeviceAllow", "PrivateNetwork", "PrivateUsers"}
-    assert {"AF_CAN", "AF_UNIX"} <= set(unit["RestrictAddressFamilies"].split())
+    # libusb, which a gs_usb adapter needs, waits for devices over AF_NETLINK.
+    assert {"AF_CAN", "AF_UNIX", "AF_NETLINK"} <= set(unit["RestrictAddressFamilies"].split())
     assert unit["SupplementaryGroups"] == "dialout"
     filters = [value for key, value in settings() if key == "SystemCallFilter"]
     # @resources has sched_setscheduler, @memlock has mlockall; both are in @system-service.

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections import Counter
+from pathlib import Path
 
 import can
 import can.interfaces.virtual as virtual_bus
@@ -17,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.transport import can as can_transport
 from drivers.transport.can import (
     ECHO_NS,
     GARBAGE_LIMIT,
@@ -193,8 +195,9 @@ def test_a_file_in_the_users_home_changes_nothing(tmp_path, monkeypatch):
         assert [received.frame.can_id for received in collect(transport, 1)] == [0x111]
 
 
-def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch):
-    requested = []
+def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypatch, tmp_path):
+    requested, port = [], str(tmp_path / "x")
+    Path(port).touch()
 
     def refuse(**settings):
         requested.append(settings)
@@ -203,16 +206,21 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
     monkeypatch.setattr(can, "Bus", refuse)
     for medium in (
         CanMedium("virtual", "one", 250_000, {"rx_queue_size": 7}),
-        CanMedium("slcan", "/dev/x", 125_000),
-        CanMedium("slcan", "/dev/x", 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
+        CanMedium("slcan", port, 125_000),
+        CanMedium("slcan", port, 125_000, {"sleep_after_open": 2.0, "tty_baudrate": 9600}),
+        CanMedium("gs_usb", "1", 125_000),
+        CanMedium("gs_usb", "1", 125_000, {"bus": 1, "address": 2}),
     ):
         with pytest.raises(OSError, match="not here"):
             medium.connect(TransportCounters())
-    plain = {"interface": "slcan", "channel": "/dev/x", "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
+    plain = {"interface": "slcan", "channel": port, "ignore_config": True, "bitrate": 125_000, "timeout": 0.1}
+    usb = {"interface": "gs_usb", "channel": "1", "ignore_config": True, "bitrate": 125_000}
     assert requested == [
         {"interface": "virtual", "channel": "one", "ignore_config": True, "bitrate": 250_000, "rx_queue_size": 7},
         {**plain, "sleep_after_open": 0.0},
         {**plain, "sleep_after_open": 2.0, "tty_baudrate": 9600},
+        {**usb, "index": 1},
+        {**usb, "bus": 1, "address": 2},
     ]
 
 
@@ -220,10 +228,15 @@ def test_the_bus_is_opened_as_asked_and_options_go_through_as_they_are(monkeypat
 MULTICAST_GROUP = "ff11::6469:7363"
 
 
-@pytest.mark.parametrize("interface", ["virtual", "udp_multicast"])
-def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(interface):
+@pytest.mark.parametrize("interface", ["virtual", "udp_multicast", "gs_usb"])
+def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(interface, monkeypatch):
     if interface == "virtual":
         channel, options, own = next(CHANNELS), {}, {"receive_own_messages": True}
+    elif interface == "gs_usb":
+        # In place of an adapter, whose firmware echoes each frame that the host sends.
+        channel, options, own, open_bus = next(CHANNELS), {}, {}, can.Bus
+        echoing = {"interface": "virtual", "receive_own_messages": True}
+        monkeypatch.setattr(can, "Bus", lambda **settings: open_bus(**settings | echoing))
     else:
         # A free port, so that runs side by side do not hear each other.
         channel, options, own = MULTICAST_GROUP, {"port": free_port(socket.SOCK_DGRAM), "hop_limit": 0}, {}
@@ -239,6 +252,20 @@ def test_a_bus_that_hands_back_own_frames_brings_those_of_another_host_only(inte
         other.send(message(0x111))
         got = [(received.frame.can_id, received.frame.data) for received in collect(transport, 2)]
         assert got == [(0x100, b"\4"), (0x111, b"\x01\x02")]
+
+
+def test_datagrams_that_are_no_frames_are_counted_and_do_not_cost_the_session():
+    port = free_port(socket.SOCK_DGRAM)
+    with (
+        opened_bus("udp_multicast", MULTICAST_GROUP, port=port, hop_limit=0) as transport,
+        socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as stranger,
+    ):
+        up(transport)
+        # In msgpack a number, more than one value, {"a": 1} and {"dlc": "a"}.
+        for number, datagram in enumerate((b"\x01", b"hello", b"\x81\xa1a\x01", b"\x81\xa3dlc\xa1a"), 1):
+            stranger.sendto(datagram, (MULTICAST_GROUP, port))
+            wait_until(lambda: transport.stats.malformed == number, timeout_s=2.0)  # noqa: B023
+        assert transport.generation == 1
 
 
 def test_a_frame_that_found_no_room_excuses_no_other_hosts():
@@ -329,6 +356,16 @@ def test_socketcand_by_host_and_port_from_the_options():
 
         wait_until(is_connecting)
         wait_until(lambda: "start the other end first" in (transport.last_error or ""))
+
+
+def test_a_socketcand_server_that_says_nothing_is_named_and_tried_again(monkeypatch):
+    monkeypatch.setattr(can_transport, "_PROBE_TIMEOUT_S", 0.05)
+    # The system accepts for it.
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        port = silent.getsockname()[1]
+        with opened_bus("socketcand", "can7", host="127.0.0.1", port=port) as transport:
+            wait_until(lambda: transport.last_error, timeout_s=2.0)
+            assert "sends no greeting" in transport.last_error
 
 
 def test_a_bus_over_a_port_that_stays_mute_is_opened_again(terminal):
@@ -442,6 +479,17 @@ def test_slcan_adapter_unplugged_and_plugged_in_again_leaks_nothing(slcan, termi
         terminal.write(b"t110101\r")
         assert collect(slcan, 1)[-1].frame == Frame(0x110, b"\x01")
     wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
+
+
+def test_slcan_adapter_in_use_takes_no_second_link_which_writes_nothing_to_it(slcan, terminal):
+    written = bytes(terminal.received)
+    with opened_bus("slcan", f"{terminal.path}@9600") as second:
+        wait_until(lambda: second.last_error)
+        assert "in use by another program" in second.last_error
+    assert terminal.received == written
+    with opened(CanMedium("slcan", str(terminal.path), 500_000, exclusive=False)) as stop:
+        up(stop)
+    assert slcan.generation == 1
 
 
 def test_slcan_adapter_that_reads_nothing_blocks_nobody_and_frames_expire(slcan, terminal):
