@@ -333,20 +333,27 @@ def default_task() -> RobotTask:
     return task_from({})
 
 
+def kind_in(section: Mapping[str, Any]) -> str:
+    """Return the kind of task that [task] of robot.toml says; raises UnknownKind for what is no text.
+
+    Without `kind` it is the kind that claims one of the section's fields, else the kind that claims none in particular.
+    """
+    kind = section.get("kind")
+    if kind is None:
+        kind = _implied_kind(section)
+    if not isinstance(kind, str):
+        raise UnknownKind(f"{kind!r} is not a kind of task; write one of {', '.join(kinds())}")
+    return kind
+
+
 def task_from(section: Mapping[str, Any]) -> RobotTask:
     """Return the task that [task] of robot.toml says, validated; the files that it names are not read.
 
-    Without `kind` it is of the kind that claims one of the section's fields, else of the kind that claims none in
-    particular. Raises UnknownKind, ReadField, and msgspec.ValidationError for fields that the kind does not have or
-    values that they cannot take.
+    Raises UnknownKind, ReadField, and msgspec.ValidationError for fields that the kind does not have or values that
+    they cannot take.
     """
-    fields = dict(section)
-    kind = fields.pop("kind", None)
-    if kind is None:
-        kind = _implied_kind(fields)
-    if not isinstance(kind, str):
-        raise UnknownKind(f"{kind!r} is not a kind of task; write one of {', '.join(kinds())}")
-    task_type = task_class(kind)
+    task_type = task_class(kind_in(section))
+    fields = {name: value for name, value in section.items() if name != "kind"}
     for name in task_type.read_fields:
         if name in fields:
             raise ReadField(f"{name}: no such field; write way-points in a CSV and name it in path")
