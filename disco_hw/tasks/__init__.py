@@ -76,6 +76,10 @@ class Chassis(Protocol):
         """Nominal distance between left and right wheels."""
 
     @property
+    def x_icr_m(self) -> float:
+        """Distance (m) from the tracked point forward to the point about which the robot turns."""
+
+    @property
     def max_wheel_speed_rad_s(self) -> float:
         """The fastest that a wheel may turn."""
 
@@ -102,18 +106,40 @@ def beyond_poses(figure: str, size: str, center_m: Point, reach_m: float) -> Fie
     return None
 
 
+def straight_fastest_m_s(robot: Chassis) -> float:
+    """Speed straight ahead at which the wheels of the nominal robot are at their limit."""
+    return robot.max_wheel_speed_rad_s * robot.wheel_radius_m
+
+
 def too_fast(
     speed_m_s: float, fastest_m_s: float, robot: Chassis, wheels: str, where: str = "", instead: str = ""
-) -> str | None:
-    """Return why these `wheels` of the nominal robot cannot do a speed, and the remedy; None if they can.
+) -> FieldFault | None:
+    """Return the fault of a speed that these `wheels` of the nominal robot cannot do; None if they can.
 
     `where`: what follows the speed, such as " on a radius of 1 m"; `instead`: another remedy, such as ", or ...".
     """
     if speed_m_s <= fastest_m_s:
         return None
-    return (
-        f"{speed_m_s:g} m/s{where} needs more than {robot.max_wheel_speed_rad_s:g} rad/s of {wheels}; write at most "
-        f"{math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s{instead}"
+    return FieldFault(
+        "speed_m_s",
+        f"{speed_m_s:g} m/s{where} needs more than {robot.max_wheel_speed_rad_s:g} rad/s of {wheels}",
+        f"write at most {math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s{instead}",
+    )
+
+
+def least_size_m(per_x_icr: float, robot: Chassis) -> float:
+    """Return so many times the robot's x_icr, in whole millimetres: the smallest that a figure may be for it."""
+    return math.ceil(1000.0 * per_x_icr * abs(robot.x_icr_m)) / 1000.0
+
+
+def too_small(field: str, size_m: float, least_m: float, robot: Chassis) -> FieldFault | None:
+    """Return the fault of a figure's size, in `field`, that the robot's tracked point cannot follow; None if it can."""
+    if size_m >= least_m:
+        return None
+    return FieldFault(
+        field,
+        f"{size_m:g} m is too small: the robot turns about a point {abs(robot.x_icr_m):.3g} m from the tracked one",
+        f"write at least {least_m:g}",
     )
 
 
@@ -231,8 +257,8 @@ class RobotTask(Protocol):
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which a wheel of the nominal robot is at its limit on this task."""
 
-    def too_fast(self, robot: Chassis) -> str | None:
-        """Return why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+    def beyond_robot(self, robot: Chassis) -> FieldFault | None:
+        """Return what of the task the nominal robot cannot do, with the x_icr of its model; None if it can do it."""
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
         """Return the fields that a person may change; the largest speed is that on the present line."""
