@@ -116,14 +116,16 @@ def too_fast(
 ) -> FieldFault | None:
     """Return the fault of a speed that these `wheels` of the nominal robot cannot do; None if they can.
 
-    `where`: what follows the speed, such as " on a radius of 1 m"; `instead`: another remedy, such as ", or ...".
+    `where`: what follows the speed, such as " on a radius of 1 m"; `instead`: a gentler bend, such as ", or ...", which
+    is offered for a speed that the wheels can do straight ahead.
     """
     if speed_m_s <= fastest_m_s:
         return None
     return FieldFault(
         "speed_m_s",
         f"{speed_m_s:g} m/s{where} needs more than {robot.max_wheel_speed_rad_s:g} rad/s of {wheels}",
-        f"write at most {math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s{instead}",
+        f"write at most {math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s"
+        f"{instead if speed_m_s < straight_fastest_m_s(robot) else ''}",
     )
 
 

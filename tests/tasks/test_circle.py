@@ -106,6 +106,12 @@ def test_a_circle_that_the_tracked_point_cannot_go_round_is_refused_with_the_lea
     assert CircleTask(radius_m=0.1, speed_m_s=0.1).beyond_robot(Robot(**GEOMETRY)) is None
 
 
+def test_a_larger_radius_is_offered_only_where_it_helps():
+    robot = Robot(**GEOMETRY)
+    assert CircleTask(speed_m_s=0.45).beyond_robot(robot).hint == "write at most 0.397 m/s, or a larger radius"
+    assert CircleTask(speed_m_s=0.6).beyond_robot(robot).hint == "write at most 0.397 m/s"
+
+
 def test_the_section_gives_cost_and_outline():
     task = CircleTask(center_x_m=1.0, radius_m=2.0, speed_m_s=0.3)
     circle = task.planned("default")
