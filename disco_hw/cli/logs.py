@@ -126,7 +126,7 @@ def fence_of(
     log: Annotated[Path, typer.Argument(metavar="LOG", help="A log of a drive once round along the edge.")],
     as_json: AsJson = False,
 ) -> None:
-    """Write the [fence] along which a robot was driven or pushed, for its robot.toml (docs/fence.md)."""
+    """Write the fence along which a robot was driven or pushed, for its robot.toml (docs/fence.md)."""
     check_named_files(logs=[log])
     from disco_hw.first_use.fence_drive import fence_of_log, fence_toml
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -12,10 +12,9 @@ import msgspec
 from disco_hw.config.robot import Link, PoseInput, Prior, Robot, RobotConfig
 from disco_hw.errors import FieldFault, InputError
 from disco_hw.fence import fence_fault
-from disco_hw.files import ROBOT_TOML, control_character_in, describe, read_toml
-from drivers.motor import DriverFieldError, UnknownDriverError, fields_of, find_driver
-from drivers.pose import DEFAULT, PoseSourceError, find_pose_source, pose_sources
-from drivers.pose import fields_of as own_pose_fields
+from disco_hw.files import ROBOT_TOML, control_character_in, describe, field_of_others, read_toml
+from drivers.motor import UnknownDriverError, find_driver, motor_drivers
+from drivers.pose import DEFAULT, PoseSourceError, fields_of, find_pose_source, pose_sources
 from drivers.pose.senders import parse_allowed
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def _without_task(path: Path, raw: dict[str, Any]) -> RobotConfig:
     try:
         config = msgspec.convert({**raw, "link": common, "task": None}, RobotConfig)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {describe(error, [RobotConfig], 'docs/robot.md')}") from None
+        raise InputError(f"{path}: {describe(error, RobotConfig, 'docs/robot.md')}") from None
     config = msgspec.structs.replace(config, link=msgspec.structs.replace(config.link, of_driver=of_driver))
     given = {name: getattr(config.prior, name) for name in raw.get("prior", {})}
     config = msgspec.structs.replace(config, prior=msgspec.structs.replace(prior_around(config.robot), **given))
@@ -84,16 +83,16 @@ def _split_link(path: Path, section: Any) -> tuple[Any, Any]:
         return section, None
     if "of_driver" in section:
         raise InputError(f"{path}: link.of_driver: no such field; remove it")
-    name = section.get("driver")
-    try:
-        fields = fields_of(name, section)
-    except DriverFieldError as error:
-        raise InputError(f"{path}: link.{error}; remove it, or name that driver") from None
-    kind = find_driver(name).settings
+    driver = find_driver(section.get("driver"))
+    kind = driver.settings
+    fields = {name: value for name, value in section.items() if name in kind.__struct_fields__}
+    if unknown := section.keys() - {*fields, *Link.__struct_fields__}:
+        drivers = {name: one.settings.__struct_fields__ for name, one in motor_drivers().items()}
+        _refuse_fields_of_others(path, "link", "driver", driver.name, unknown, drivers)
     try:
         settings = msgspec.convert(fields, kind)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {describe(error, [kind], 'docs/robot.md', 'link')}") from None
+        raise InputError(f"{path}: {describe(error, kind, 'docs/robot.md', 'link')}") from None
     fault = settings.fault()
     if fault is not None:
         raise InputError(f"{path}: link.{fault.field}: {fault.fault}; {fault.hint}")
@@ -132,19 +131,25 @@ def prior_around(robot: Robot) -> Prior:
 
 def _task_of(path: Path, section: object) -> RobotTask:
     """Return the task that [task] says; its kind knows which fields that has."""
-    from disco_hw.tasks import ReadField, UnknownKind, kinds, task_class, task_from  # noqa: PLC0415
+    from disco_hw.tasks import ReadField, UnknownKind, kind_in, kinds, task_class, task_from  # noqa: PLC0415
 
     if not isinstance(section, dict):
         raise InputError(f"{path}: task: not a section; write [task] above its fields")
     try:
-        return task_from(section)
+        kind = kind_in(section)
+        task_type = task_class(kind)
     except UnknownKind as error:
         raise InputError(f"{path}: task.kind: {error}") from None
+    if unknown := section.keys() - {"kind", *task_type.__struct_fields__}:
+        types = {one: task_class(one) for one in kinds()}
+        fields = {one: {*of.__struct_fields__} - {*of.read_fields} for one, of in types.items()}
+        _refuse_fields_of_others(path, "task", "kind", kind, unknown, fields)
+    try:
+        return task_from(section)
     except ReadField as error:
         raise InputError(f"{path}: [task] {error}") from None
     except msgspec.ValidationError as error:
-        fault = describe(error, [task_class(kind) for kind in kinds()], "docs/robot.md", "task")
-        raise InputError(f"{path}: {fault}") from None
+        raise InputError(f"{path}: {describe(error, task_type, 'docs/robot.md', 'task')}") from None
 
 
 def _check_names(path: Path, raw: dict[str, Any]) -> None:
@@ -178,20 +183,25 @@ _OF_EVERY_SOURCE = {"position_std_m", "yaw_std_rad"}
 
 def _check_pose_fields(path: Path, section: Any) -> None:
     """Refuse fields of another pose source, and what no further source has."""
+    owned = {source: fields_of(source) for source in pose_sources()}
     for where, one in _pose_sections(section):
         if one is not section and "source" not in one:
             _refuse(path, where, "does not say which source", f"add source, one of {', '.join(pose_sources())}")
         name = str(one.get("source", DEFAULT))
-        fields = own_pose_fields(name)
-        for other in pose_sources():
-            for field in sorted(own_pose_fields(other) - fields - _OF_EVERY_SOURCE):
-                if field in one:
-                    fault = f'belongs to the source "{other}", but {where}.source is "{name}"'
-                    _refuse(path, f"{where}.{field}", fault, "remove it")
+        _refuse_fields_of_others(path, where, "source", name, one.keys() - owned[name] - _OF_EVERY_SOURCE, owned)
         if one is not section and "also" in one:
             _refuse(path, f"{where}.also", "sources are not nested", "write another [[pose.also]]")
         if one is not section and "rate_hz" in one:
             _refuse(path, f"{where}.rate_hz", "decides nothing any more", "remove it")
+
+
+def _refuse_fields_of_others(
+    path: Path, where: str, choice: str, chosen: str, names: Iterable[str], fields: Mapping[str, Collection[str]]
+) -> None:
+    """Refuse the first of the names, none of the chosen kind, driver or source, that is a field of another one."""
+    for name in sorted(names):
+        if owners := [other for other, own in fields.items() if name in own]:
+            _refuse(path, f"{where}.{name}", *field_of_others(choice, owners, f', but {where}.{choice} is "{chosen}"'))
 
 
 def _refuse(path: Path, field: str, fault: str, hint: str) -> NoReturn:
@@ -240,7 +250,9 @@ def _check(path: Path, config: RobotConfig) -> None:
     if control.telemetry_disarm_s <= control.telemetry_zero_s:
         _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
     driver = find_driver(config.link.driver)
-    if config.link.kind not in driver.kinds:
+    # Every other medium carries CAN frames, as the one of that name does (docs/add-a-transport.md).
+    spoken = "serial" if config.link.kind == "serial" else "can"
+    if spoken not in driver.kinds:
         known = " or ".join(f'"{kind}"' for kind in driver.kinds)
         _refuse(
             path, "link.kind", f'the driver {driver.name} does not speak over "{config.link.kind}"', f"write {known}"

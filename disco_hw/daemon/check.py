@@ -99,7 +99,7 @@ def run_check(robot: Path, link: str | None = None) -> CheckReport:
     setup = load_setup(robot, None, link)
     key, transport = link_key(setup), create_link(setup)
     refuse_while_daemon_runs(setup.config)
-    checks = [_model_check(setup), _adaptation_check(setup), check_task(setup.config)]
+    checks = [_model_check(setup), _adaptation_check(setup), check_task(setup.task_config)]
     checks.append(check_link_load(setup.config.link, setup.config.control))
     checks += check_fence(setup.config.robot, setup.config.fence)
     control = setup.config.control

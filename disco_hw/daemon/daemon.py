@@ -306,7 +306,7 @@ class Daemon:
     def _change_task(self, message: ControlMessage) -> None:
         """Change the task, if this state and the robot's limits allow it."""
         try:
-            task = changed_task(self._core.task, message.arguments, self._core.config, self._core.state)
+            task = changed_task(self._core.task, message.arguments, self._core.task_config, self._core.state)
             fault = task_breach(self._core.area.fence, self._core.config.footprint_along_line, task.course())
             if fault is not None:
                 raise TaskRefused(f"fence: {fault}; keep the task inside")

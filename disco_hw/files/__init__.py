@@ -219,13 +219,13 @@ def _why(error: OSError | ValueError) -> str:
 _STEP = re.compile(r"\.(\w+)|\[\.*\d*\.*\]")
 
 
-def describe(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, within: str = "") -> str:
+def describe(error: msgspec.ValidationError, kind: type, docs: str, within: str = "") -> str:
     """Return one line for an invalid field: its name, what is wrong, and the values or the name that it could have.
 
-    `docs` says what each value means. `kinds` are the types that the table could have been converted to, `within` is
-    its section.
+    `docs` says what each value means. `kind` is the type that the table should have been converted to, `within` is its
+    section.
     """
-    roots = [inspect.type_info(kind) for kind in kinds]
+    roots = [inspect.type_info(kind)]
     text, _, where = str(error).partition(" - at `$")
     place = where.rstrip("`")
     field = f"{within}{place}".lstrip(".")
@@ -240,10 +240,23 @@ def describe(error: msgspec.ValidationError, kinds: Sequence[type], docs: str, w
         choices = _tags(here, name)
         add = f"add it: {_one_of(choices)}" if choices else "add it"
         return f"{section}{name}: missing; {add} ({docs} says what it means)"
-    fields = (one.encode_name for kind in here if isinstance(kind, inspect.StructType) for one in kind.fields)
-    near = nearest(name, fields)
+    structs = [one for one in here if isinstance(one, inspect.StructType)]
+    if owners := [one for one in structs if name in _names(one)]:
+        fault, hint = field_of_others(str(owners[0].tag_field), [str(one.tag) for one in owners])
+        return f"{section}{name}: {fault}; {hint}"
+    near = nearest(name, (known for one in structs for known in _names(one)))
     hint = f"did you mean {near}?" if near else "check the spelling or remove it"
     return f"{section}{name}: no such field; {hint} ({docs} lists every field)"
+
+
+def field_of_others(choice: str, owners: Iterable[str], but: str = "") -> tuple[str, str]:
+    """Return fault and hint for a field that only `owners` have, other values of `choice` than the one chosen.
+
+    `but` says which that is, where it is known.
+    """
+    *others, last = (f'"{owner}"' for owner in owners)
+    listed, written = (f"{', '.join(others)} or {last}", "one of those") if others else (last, last)
+    return f"belongs to the {choice} {listed}{but}", f"write {choice} = {written}, or remove it"
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:
@@ -269,6 +282,10 @@ def _types_at(roots: Sequence[inspect.Type], place: str) -> list[inspect.Type]:
 def _members(types: Sequence[inspect.Type]) -> list[inspect.Type]:
     """Return the types with unions taken apart."""
     return [member for one in types for member in (one.types if isinstance(one, inspect.UnionType) else (one,))]
+
+
+def _names(struct: inspect.StructType) -> list[str]:
+    return [field.encode_name for field in struct.fields]
 
 
 def _choices(types: Sequence[inspect.Type]) -> list[str]:

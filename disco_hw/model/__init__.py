@@ -70,7 +70,7 @@ def load_model(path: Path | str) -> Model:
     try:
         content = msgspec.convert(raw, _File)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {describe(error, [_File], 'docs/control.md')}") from None
+        raise InputError(f"{path}: {describe(error, _File, 'docs/control.md')}") from None
     try:
         return _model(content)
     except ValueError as error:

@@ -40,7 +40,7 @@ from disco_hw.runtime.fence_guard import FenceGuard, StoppingSettings
 from disco_hw.runtime.obstacles import obstacle_source_of
 from disco_hw.runtime.pipeline import Governor, Pipeline, Planner, WheelLimits
 from disco_hw.runtime.preflight import Level, check_firmware_limits, check_task
-from disco_hw.runtime.robot_setup import Setup, geometry
+from disco_hw.runtime.robot_setup import Setup, config_for_tasks, geometry
 from disco_hw.runtime.supervisor import Supervisor, SupervisorSettings
 from drivers.motor import create_driver, find_driver, rewired
 from drivers.pose import PoseSourceError, SeveralPoses, converted, create_pose_source
@@ -197,7 +197,7 @@ def assemble_core(
         )
     )
     # Who drives by hand, and so without a pose, does not do the task.
-    check = partial(preflight, config, with_task=needs_pose)
+    check = partial(preflight, config_for_tasks(config, pipeline.fusion.parameters.x_icr_m), with_task=needs_pose)
     sources = pose_source_of(config), obstacle_source_of(config)
     adapting = adaptation or NoAdaptation()
     return DaemonCore(config, transport, driver, supervisor, pipeline, recorder, check, adapting, *sources)

@@ -21,7 +21,7 @@ from disco_hw.runtime.directions import Directions
 from disco_hw.runtime.obstacles import TOO_MANY, ObstacleRefused, UdpObstacles
 from disco_hw.runtime.pipeline import FollowTask, Motion, Off, Pipeline, Source, Standstill, Tick, untimed
 from disco_hw.runtime.plausibility import FOLLOWS, Headway, PlannerEvents, Plausibility, PlausibilityStats, PoseJumps
-from disco_hw.runtime.robot_setup import record_of
+from disco_hw.runtime.robot_setup import config_for_tasks, record_of
 from disco_hw.runtime.safe_area import SafeArea
 from disco_hw.runtime.supervisor import Inputs, Output, Reply, Supervisor, UserRequest
 from disco_hw.runtime.wheel_faults import WheelFaults
@@ -80,6 +80,8 @@ class DaemonCore:
         obstacle_source: UdpObstacles | None,
     ) -> None:
         self.config = config
+        self.task_config = config_for_tasks(config, pipeline.fusion.parameters.x_icr_m)
+        """What another task is judged by."""
         self.transport = transport
         self.driver = driver
         self.pose_source = pose_source

@@ -132,11 +132,11 @@ def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
 
 
 def check_task(config: RobotConfig) -> Check:
-    """Compare the task's speed with what the nominal robot's wheels can do on it."""
+    """Compare the task with what the nominal robot can do; `config` is that of `config_for_tasks`."""
     robot, task = config.robot, config.task
-    refusal = task.too_fast(robot)
-    if refusal is not None:
-        return Check("task", Level.FAIL, f"task.speed_m_s: {refusal}")
+    fault = task.beyond_robot(robot)
+    if fault is not None:
+        return Check("task", Level.FAIL, f"task.{fault.field}: {fault.fault}; {fault.hint}")
     backwards = ", driven backwards" if config.turned_rad else ""
     return Check(
         "task", Level.OK, f"{task.describe()}{backwards}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it"

@@ -54,6 +54,16 @@ class Setup:
     config: RobotConfig
     model: Model
 
+    @property
+    def task_config(self) -> RobotConfig:
+        """`config` as tasks are judged by it, with the x_icr of the model."""
+        return config_for_tasks(self.config, geometry(self.model)[0][2])
+
+
+def config_for_tasks(config: RobotConfig, x_icr_m: float) -> RobotConfig:
+    """Return what tasks are judged by: robot.toml with the x_icr of the robot's model in place of the nominal one."""
+    return msgspec.structs.replace(config, robot=msgspec.structs.replace(config.robot, x_icr_m=x_icr_m))
+
 
 def load_setup(robot: Path, model: Path | None = None, link: str | None = None, path_file: Path | None = None) -> Setup:
     """Read robot.toml, the model and the task's file; the other arguments override what robot.toml says.
@@ -182,8 +192,8 @@ class TaskRefused(Exception):  # noqa: N818
 def changed_task(task: RobotTask, requested: Mapping[str, Any], config: RobotConfig, state: State) -> RobotTask:
     """Return the task with the fields in `requested`, all of them editable, m and m/s.
 
-    Raises TaskRefused while the robot is armed or stopping, for anything that is no number within the limits, for a
-    speed that the wheels cannot reach on the changed task, and for what robot.toml would be refused for.
+    `config` is that of `config_for_tasks`. Raises TaskRefused while the robot is armed or stopping, for anything that
+    is no number within the limits, for what the robot cannot do, and for what robot.toml would be refused for.
     """
     if state in IN_USE:
         raise TaskRefused(
@@ -201,10 +211,7 @@ def changed_task(task: RobotTask, requested: Mapping[str, Any], config: RobotCon
         # What the wheels can do depends on the other fields too, and is judged below.
         values[name] = _number(name, value, low, _FASTEST_M_S if name == "speed_m_s" else high)
     changed = with_values(task, values)
-    refusal = changed.too_fast(config.robot)
-    if refusal is not None:
-        raise TaskRefused(refusal)
-    fault = task_fault(config, changed)
+    fault = changed.beyond_robot(config.robot) or task_fault(config, changed)
     if fault is not None:
         raise TaskRefused(f"{fault.field}: {fault.fault}; {fault.hint}")
     return changed

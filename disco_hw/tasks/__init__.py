@@ -76,6 +76,10 @@ class Chassis(Protocol):
         """Nominal distance between left and right wheels."""
 
     @property
+    def x_icr_m(self) -> float:
+        """Distance (m) from the tracked point forward to the point about which the robot turns."""
+
+    @property
     def max_wheel_speed_rad_s(self) -> float:
         """The fastest that a wheel may turn."""
 
@@ -102,18 +106,42 @@ def beyond_poses(figure: str, size: str, center_m: Point, reach_m: float) -> Fie
     return None
 
 
+def straight_fastest_m_s(robot: Chassis) -> float:
+    """Speed straight ahead at which the wheels of the nominal robot are at their limit."""
+    return robot.max_wheel_speed_rad_s * robot.wheel_radius_m
+
+
 def too_fast(
     speed_m_s: float, fastest_m_s: float, robot: Chassis, wheels: str, where: str = "", instead: str = ""
-) -> str | None:
-    """Return why these `wheels` of the nominal robot cannot do a speed, and the remedy; None if they can.
+) -> FieldFault | None:
+    """Return the fault of a speed that these `wheels` of the nominal robot cannot do; None if they can.
 
-    `where`: what follows the speed, such as " on a radius of 1 m"; `instead`: another remedy, such as ", or ...".
+    `where`: what follows the speed, such as " on a radius of 1 m"; `instead`: a gentler bend, such as ", or ...", which
+    is offered for a speed that the wheels can do straight ahead.
     """
     if speed_m_s <= fastest_m_s:
         return None
-    return (
-        f"{speed_m_s:g} m/s{where} needs more than {robot.max_wheel_speed_rad_s:g} rad/s of {wheels}; write at most "
-        f"{math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s{instead}"
+    return FieldFault(
+        "speed_m_s",
+        f"{speed_m_s:g} m/s{where} needs more than {robot.max_wheel_speed_rad_s:g} rad/s of {wheels}",
+        f"write at most {math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s"
+        f"{instead if speed_m_s < straight_fastest_m_s(robot) else ''}",
+    )
+
+
+def least_size_m(per_x_icr: float, robot: Chassis) -> float:
+    """Return so many times the robot's x_icr, in whole millimetres: the smallest that a figure may be for it."""
+    return math.ceil(1000.0 * per_x_icr * abs(robot.x_icr_m)) / 1000.0
+
+
+def too_small(field: str, size_m: float, least_m: float, robot: Chassis) -> FieldFault | None:
+    """Return the fault of a figure's size, in `field`, that the robot's tracked point cannot follow; None if it can."""
+    if size_m >= least_m:
+        return None
+    return FieldFault(
+        field,
+        f"{size_m:g} m is too small: the robot turns about a point {abs(robot.x_icr_m):.3g} m from the tracked one",
+        f"write at least {least_m:g}",
     )
 
 
@@ -231,8 +259,8 @@ class RobotTask(Protocol):
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which a wheel of the nominal robot is at its limit on this task."""
 
-    def too_fast(self, robot: Chassis) -> str | None:
-        """Return why the wheels of the nominal robot cannot do the task, and the remedy; None if they can."""
+    def beyond_robot(self, robot: Chassis) -> FieldFault | None:
+        """Return what of the task the nominal robot cannot do, with the x_icr of its model; None if it can do it."""
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
         """Return the fields that a person may change; the largest speed is that on the present line."""
@@ -333,20 +361,27 @@ def default_task() -> RobotTask:
     return task_from({})
 
 
+def kind_in(section: Mapping[str, Any]) -> str:
+    """Return the kind of task that [task] of robot.toml says; raises UnknownKind for what is no text.
+
+    Without `kind` it is the kind that claims one of the section's fields, else the kind that claims none in particular.
+    """
+    kind = section.get("kind")
+    if kind is None:
+        kind = _implied_kind(section)
+    if not isinstance(kind, str):
+        raise UnknownKind(f"{kind!r} is not a kind of task; write one of {', '.join(kinds())}")
+    return kind
+
+
 def task_from(section: Mapping[str, Any]) -> RobotTask:
     """Return the task that [task] of robot.toml says, validated; the files that it names are not read.
 
-    Without `kind` it is of the kind that claims one of the section's fields, else of the kind that claims none in
-    particular. Raises UnknownKind, ReadField, and msgspec.ValidationError for fields that the kind does not have or
-    values that they cannot take.
+    Raises UnknownKind, ReadField, and msgspec.ValidationError for fields that the kind does not have or values that
+    they cannot take.
     """
-    fields = dict(section)
-    kind = fields.pop("kind", None)
-    if kind is None:
-        kind = _implied_kind(fields)
-    if not isinstance(kind, str):
-        raise UnknownKind(f"{kind!r} is not a kind of task; write one of {', '.join(kinds())}")
-    task_type = task_class(kind)
+    task_type = task_class(kind_in(section))
+    fields = {name: value for name, value in section.items() if name != "kind"}
     for name in task_type.read_fields:
         if name in fields:
             raise ReadField(f"{name}: no such field; write way-points in a CSV and name it in path")

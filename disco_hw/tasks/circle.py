@@ -25,20 +25,25 @@ from disco_hw.tasks import (
     Prepared,
     RobotTask,
     beyond_poses,
+    least_size_m,
     norm,
     norm_and_inverse,
     single,
+    straight_fastest_m_s,
     too_fast,
+    too_small,
 )
 
 RADIUS_M = (0.1, 50.0)
-"""Least and largest radius that a person may change it to."""
+"""Least and largest radius that a person may change it to; the least is larger for a robot with a large x_icr."""
 # The radius over the distance from the centre below which progress stops growing.
 NEAR_CENTRE = 2.0
 # The last heading's error counts so many times the distance that it swings the tracked point by.
 TURN_WEIGHT = 2.0
 # Sine of the largest angle between heading and way: on a smaller circle the tracked point could only be turned about.
 MOST_TURNED = 0.95
+# The least radius, at which a simulated robot stays within 6 mm. What paths need between turns is a length of way.
+_PER_X_ICR = 1.0 / MOST_TURNED
 _ZERO, _TWO = single(0.0), single(2.0)
 
 
@@ -70,11 +75,12 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which the outer wheel is at its limit."""
         outer = 1.0 + 0.5 * robot.axial_distance_m / self.radius_m
-        return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
+        return straight_fastest_m_s(robot) / outer
 
-    def too_fast(self, robot: Chassis) -> str | None:
-        """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
-        return too_fast(
+    def beyond_robot(self, robot: Chassis) -> FieldFault | None:
+        """Return the fault of a radius or speed that the robot cannot go round with, or None."""
+        fault = too_small("radius_m", self.radius_m, least_size_m(_PER_X_ICR, robot), robot)
+        return fault or too_fast(
             self.speed_m_s,
             self.fastest_m_s(robot),
             robot,
@@ -85,8 +91,9 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
         """Return the ranges of all fields; the largest speed is that on the present radius."""
+        low, high = RADIUS_M
         return {
-            "radius_m": Editable(*RADIUS_M, "Radius (m)"),
+            "radius_m": Editable(max(low, least_size_m(_PER_X_ICR, robot)), high, "Radius (m)"),
             "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
             "center_x_m": Editable(*CENTER_M, "Centre x (m)"),
             "center_y_m": Editable(*CENTER_M, "Centre y (m)"),
@@ -94,7 +101,7 @@ class CircleTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     def editing_note(self, robot: Chassis) -> str:
         """Return the range of the radius and the largest speed."""
-        low, high = RADIUS_M
+        low, high, _ = self.editable(robot)["radius_m"]
         return f"Radius {low:g} to {high:g} m; at {self.radius_m:g} m at most {self.fastest_m_s(robot):.3f} m/s."
 
     def describe(self) -> str:

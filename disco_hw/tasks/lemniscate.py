@@ -13,7 +13,19 @@ import numpy as np
 from msgspec import Meta
 
 from disco_hw.errors import FieldFault
-from disco_hw.tasks import CENTER_M, SLOWEST_M_S, Chassis, Editable, Point, Positive, beyond_poses, too_fast
+from disco_hw.tasks import (
+    CENTER_M,
+    SLOWEST_M_S,
+    Chassis,
+    Editable,
+    Point,
+    Positive,
+    beyond_poses,
+    least_size_m,
+    straight_fastest_m_s,
+    too_fast,
+    too_small,
+)
 from disco_hw.tasks.line import PathTable, planned_table
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, PathProgress, line_course
@@ -22,6 +34,8 @@ from disco_hw.tasks.line.course import LineCourse, PathProgress, line_course
 SIZE_M = (0.3, 50.0)
 # Chosen: more follows the curve more closely; each piece of the largest is under a metre.
 _POINTS = 400
+# Its tightest bend, a third of the size, is at least 0.8 x_icr. Chosen: simulated robots leave the figure at 0.75.
+_PER_X_ICR = 2.4
 # Chosen: smaller is a robot turning on the spot.
 _SMALLEST_M = 0.05
 
@@ -58,11 +72,11 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     def fastest_m_s(self, robot: Chassis) -> float:
         """Speed at which the outer wheel is at its limit in the tightest bend."""
         outer = 1.0 + 0.5 * robot.axial_distance_m / (self.size_m / 3.0)
-        return robot.max_wheel_speed_rad_s * robot.wheel_radius_m / outer
+        return straight_fastest_m_s(robot) / outer
 
-    def too_fast(self, robot: Chassis) -> str | None:
-        """Return why the outer wheel cannot do the task, and the remedy; None if it can."""
-        return too_fast(
+    def beyond_robot(self, robot: Chassis) -> FieldFault | None:
+        """Return the fault of a size or speed that the robot cannot follow the figure with, or None."""
+        return too_small("size_m", self.size_m, least_size_m(_PER_X_ICR, robot), robot) or too_fast(
             self.speed_m_s,
             self.fastest_m_s(robot),
             robot,
@@ -73,8 +87,9 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:
         """Return the ranges of all fields; the largest speed is that on the present size."""
+        low, high = SIZE_M
         return {
-            "size_m": Editable(*SIZE_M, "Size (m)"),
+            "size_m": Editable(max(low, least_size_m(_PER_X_ICR, robot)), high, "Size (m)"),
             "speed_m_s": Editable(SLOWEST_M_S, self.fastest_m_s(robot), "Speed (m/s)"),
             "center_x_m": Editable(*CENTER_M, "Centre x (m)"),
             "center_y_m": Editable(*CENTER_M, "Centre y (m)"),

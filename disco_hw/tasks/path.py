@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from disco_hw.errors import FieldFault, InputError
-from disco_hw.tasks import Chassis, Editable, Point, Positive
+from disco_hw.tasks import Chassis, Editable, Point, Positive, straight_fastest_m_s
 from disco_hw.tasks.line import PathTable, check_size, load_waypoints, planned_table, points_of
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import (
@@ -20,7 +20,6 @@ from disco_hw.tasks.line.course import (
     line_course,
     refuse_hairpins,
     speed_range,
-    straight_fastest_m_s,
     straight_too_fast,
 )
 
@@ -74,8 +73,8 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         """Speed straight ahead at which the wheels are at their limit."""
         return straight_fastest_m_s(robot)
 
-    def too_fast(self, robot: Chassis) -> str | None:
-        """Return why the wheels cannot do the task, and the remedy; None if they can."""
+    def beyond_robot(self, robot: Chassis) -> FieldFault | None:
+        """Return the fault of a speed that the wheels cannot do; None if they can."""
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, robot: Chassis) -> Mapping[str, Editable]:

@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from disco_hw.errors import FieldFault, InputError
-from disco_hw.tasks import Array, Chassis, Editable, Found, Point, Prepared, norm, single
+from disco_hw.tasks import Array, Chassis, Editable, Found, Point, Prepared, norm, single, straight_fastest_m_s
 from disco_hw.tasks.line import Waypoints, check_size, load_waypoints, points_of
 from disco_hw.tasks.line.cost import AGAINST_M
 from disco_hw.tasks.line.course import (
@@ -23,7 +23,6 @@ from disco_hw.tasks.line.course import (
     describe_part,
     line_course,
     stable_yaw,
-    straight_fastest_m_s,
     straight_too_fast,
 )
 
@@ -97,8 +96,8 @@ class TimedPathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """Speed straight ahead at which the wheels are at their limit."""
         return straight_fastest_m_s(robot)
 
-    def too_fast(self, robot: Chassis) -> str | None:
-        """Return why the wheels cannot do the task, and the remedy; None if they can."""
+    def beyond_robot(self, robot: Chassis) -> FieldFault | None:
+        """Return the fault of a speed that the wheels cannot do; None if they can."""
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, _robot: Chassis) -> Mapping[str, Editable]:

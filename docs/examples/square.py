@@ -5,10 +5,10 @@ from typing import ClassVar
 import msgspec
 import numpy as np
 
-from disco_hw.tasks import Editable, Positive
+from disco_hw.tasks import Editable, Positive, straight_fastest_m_s
 from disco_hw.tasks.line import PathTable
 from disco_hw.tasks.line.cost import PathCost
-from disco_hw.tasks.line.course import PathProgress, line_course, speed_range, straight_fastest_m_s, straight_too_fast
+from disco_hw.tasks.line.course import PathProgress, line_course, speed_range, straight_too_fast
 
 
 class SquareTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -29,7 +29,7 @@ class SquareTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def fastest_m_s(self, robot):
         return straight_fastest_m_s(robot)
 
-    def too_fast(self, robot):
+    def beyond_robot(self, robot):
         return straight_too_fast(self.speed_m_s, robot)
 
     def editable(self, robot):

@@ -40,14 +40,6 @@ class UnknownDriverError(ValueError):
     """No driver has this name; the message lists the names that there are."""
 
 
-class DriverFieldError(ValueError):
-    """A field of [link] that belongs to another driver than the one named."""
-
-    def __init__(self, field: str, fault: str) -> None:
-        super().__init__(f"{field}: {fault}")
-        self.field, self.fault = field, fault
-
-
 @cache
 def motor_drivers() -> Mapping[str, MotorDriver]:
     """Return the drivers by name: the `DRIVER` of each module in this folder that has one.
@@ -81,18 +73,6 @@ def create_driver(name: str | None, settings: Any = None, key: bytes | None = No
     """
     found = find_driver(name)
     return found.make(found.settings() if settings is None else settings, key)
-
-
-def fields_of(name: str | None, fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of [link] that are the driver's own; raise DriverFieldError for one of another driver's."""
-    found = find_driver(name)
-    accepted = {field: value for field, value in fields.items() if field in found.settings.__struct_fields__}
-    others = motor_drivers().values() if len(accepted) < len(fields) else ()
-    for other in others:
-        for field in fields:
-            if field in other.settings.__struct_fields__ and field not in accepted:
-                raise DriverFieldError(field, f"belongs to the driver {other.name}, but link.driver is {found.name}")
-    return accepted
 
 
 _Sign = Literal[-1, 1]

@@ -6,10 +6,12 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Iterator
 from importlib import metadata
 
 import click
 import pytest
+from rich.markup import render
 from typer.main import get_command
 from typer.testing import CliRunner
 
@@ -37,6 +39,22 @@ def test_help_lists_every_verb():
     assert code == 0
     for verb in VERBS:
         assert f" {verb} " in output
+
+
+def help_texts(command: click.Command) -> Iterator[str]:
+    """Yield the help of a command, of its options and of the commands below it."""
+    yield command.help or ""
+    for option in command.params:
+        yield getattr(option, "help", None) or ""
+    for below in getattr(command, "commands", {}).values():
+        yield from help_texts(below)
+
+
+def test_no_help_text_loses_a_bracketed_word():
+    texts = list(help_texts(get_command(app())))
+    assert len(texts) > 100
+    for text in texts:
+        assert render(text).plain == text
 
 
 @pytest.mark.parametrize(

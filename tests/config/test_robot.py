@@ -191,13 +191,26 @@ def test_a_path_is_named_in_the_task_with_or_without_its_kind(tmp_path, kind):
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        ('path = "p.csv"\nradius_m = 1.0\n', "radius_m: no such field"),
-        ('kind = "circle"\npath = "p.csv"\n', "path: no such field"),
+        (
+            'path = "p.csv"\nradius_m = 1.0\n',
+            r'task\.radius_m: belongs to the kind "circle", but task\.kind is "path"; '
+            'write kind = "circle", or remove it$',
+        ),
+        (
+            'kind = "circle"\npath = "p.csv"\n',
+            r'task\.path: belongs to the kind "path" or "timed_path", but task\.kind is "circle"; '
+            "write kind = one of those, or remove it$",
+        ),
+        ('kind = "lemniscate"\nradus_m = 1.0\n', r"radus_m: no such field; check the spelling or remove it"),
+        ('kind = "circle"\npoints = [[0.0, 0.0]]\n', "points: no such field; check the spelling or remove it"),
         ('kind = "path"\n', "path: missing; add it"),
         ('path = ""\n', "task.path: expected `str` of length >= 1"),
         ('path = "p.csv"\npoints = [[0.0, 0.0]]\n', "points: no such field; write way-points in a CSV"),
         ('path = "p.csv"\nspeed_m_s = 0.5\n', "task.speed_m_s: 0.5 m/s is above what the wheels can do"),
-        ('kind = "timed_path"\npath = "p.csv"\nspeed_m_s = 0.2\n', "speed_m_s: no such field"),
+        (
+            'kind = "timed_path"\npath = "p.csv"\nspeed_m_s = 0.2\n',
+            r'task\.speed_m_s: belongs to the kind "circle", "lemniscate" or "path", but task\.kind is "timed_path"; ',
+        ),
         ('kind = "timed_path"\n', "path: missing; add it"),
         ('kind = "timed_path"\npath = "p.csv"\ntimes_s = [0.0]\n', "times_s: no such field; write way-points in a CSV"),
     ],

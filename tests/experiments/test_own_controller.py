@@ -16,10 +16,11 @@ import pytest
 
 import disco_hw
 from disco_hw import drive_virtual
-from disco_hw.errors import InputError
+from disco_hw.errors import InputError, WorkError
 from disco_hw.experiments import with_device
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import BeliefChange
+from tests.runtime.path_robot import task_robot
 from tests.runtime.simulated import ROBOT_TEXT
 from tests.tables import thinned
 
@@ -106,6 +107,14 @@ def test_a_robot_with_another_controller_and_other_poses_is_played_too(tmp_path)
     mine.write_text(with_device(ROBOT_TEXT, "odrive"), encoding="utf-8")
     drive = drive_virtual(mine, lambda *_: (2.0, 2.0), 1.0)
     assert drive.speeds[-1] > 0.05
+
+
+def test_the_pages_law_is_asked_nothing_of_a_circle_that_is_smaller_than_it_can_be(tmp_path):
+    scope = {"__name__": "my_controller"}
+    exec(block("python", 0), scope)
+    robot = task_robot(tmp_path, 'kind = "circle"\nradius_m = 0.2\nspeed_m_s = 0.1\n')
+    with pytest.raises(WorkError, match=r"armed: task\.radius_m: 0\.2 m is too small: .*; write at least 0\.251"):
+        drive_virtual(robot, scope["steer"], 1.0)
 
 
 def test_an_effect_that_does_not_exist_is_refused_in_one_line():

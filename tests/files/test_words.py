@@ -88,6 +88,13 @@ def test_a_misspelt_name_of_a_model_gets_the_nearest(tmp_path):
     assert nearest("zzz", ["abc"]) is None
 
 
+def test_a_field_of_another_kind_of_belief_is_no_misspelling_of_itself(tmp_path):
+    text = MODEL + '[belief]\nkind = "uniform"\nnames = []\nmean = []\n'
+    assert '[belief] mean: belongs to the kind "gaussian"; write kind = "gaussian", or remove it' in refusal(
+        load_model, tmp_path / "model.toml", text
+    )
+
+
 def test_values_in_lists_have_their_place(tmp_path):
     message = refusal(load_model, tmp_path / "model.toml", MODEL + '[belief]\nkind = "gaussian"\nnames = [1]\n')
     assert "belief.names[0]: expected `str`, got `int`; correct the value" in message

@@ -4,6 +4,7 @@ import msgspec
 import pytest
 
 from disco_hw.config import Control, Link, Robot, RobotConfig
+from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.preflight import (
     Level,
     check_command_timing,
@@ -14,9 +15,13 @@ from disco_hw.runtime.preflight import (
     check_safety,
     check_task,
 )
+from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.tasks.path import PathTask
 from drivers.types import Limit, Limits, SafetyCard
+from tests.runtime.path_robot import task_robot
+from tests.runtime.simulated import replies, simulated_stack
 
 
 def robot(**changes):
@@ -179,6 +184,20 @@ def test_a_task_that_is_too_fast_for_the_wheels_fails(task):
     assert too_fast.level is Level.FAIL
     assert too_fast.text.startswith("task.speed_m_s: ")
     assert "at most" in too_fast.text
+
+
+def test_a_circle_that_is_too_small_for_the_x_icr_of_the_model_fails_and_keeps_the_robot_from_being_armed(tmp_path):
+    file = task_robot(tmp_path, 'kind = "circle"\nradius_m = 0.2\nspeed_m_s = 0.1\n')
+    setup = load_setup(file)
+    check = check_task(setup.task_config)
+    assert check.level is Level.FAIL
+    assert check.text.startswith("task.radius_m: 0.2 m is too small")
+    assert check.text.endswith("; write at least 0.251")
+    stack = simulated_stack(robot_file=file, planner=NoPlanner())
+    stack.run(0.5)
+    (reply,) = replies(stack.run(0.1, UserRequest.ARM))
+    assert not reply.accepted
+    assert check.text in reply.text
 
 
 @pytest.mark.parametrize(("facing", "said"), [("forwards", False), ("backwards", True)])

@@ -109,7 +109,10 @@ class LoopFigures:
         ('[pose]\nsource = "natnet"\nallow = ["host"]\n', r'pose\.allow: "host" is not an IPv4 address; write addr'),
         ('[[pose.also]]\nsource = "udp"\nallow = ["10.0.0.0/99"]\n',
          r'also\[0\]\.allow: "10\.0\.0\.0/99" is not an IPv4'),
-        ('[pose]\nsource = "robot"\nkey_file = "k"\n', r'pose\.key_file: belongs to the source "udp", but'),
+        ('[pose]\nsource = "robot"\nkey_file = "k"\n',
+         r'pose\.key_file: belongs to the source "udp", but pose\.source is "robot"; write source = "udp", or remove'),
+        ('[pose]\nport = 5005\n', r'pose\.port: belongs to the source "ros2" or "udp", but pose\.source is "robot"; '
+         "write source = one of those, or remove it$"),
         ('[[pose.also]]\nsource = "udp"\nprot = 7\n', r"pose\.also.*prot: no such field; did you mean port"),
         ('[[pose.also]]\nsource = "udp"\nposition_unit = "km"\n', r"pose\.also.*position_unit: .*write one of"),
         ('[[pose.also]]\nsource = "udp"\n[[pose.also.also]]\nsource = "robot"\n', r"also\[0\]\.also: sources are not"),

@@ -93,6 +93,16 @@ def test_a_change_is_refused_in_the_words_in_which_robot_toml_is(tmp_path, turn_
         assert changed_task(config.task, {name: float(least[1])}, config, State.READY).speed_m_s == float(least[1])
 
 
+def test_the_change_to_a_circle_that_is_too_small_for_the_models_x_icr_is_refused():
+    config = msgspec.structs.replace(CONFIG, robot=msgspec.structs.replace(ROBOT, x_icr_m=0.3))
+    assert limits(config.robot, CircleTask())["radius_m"][0] == 0.316
+    with pytest.raises(TaskRefused, match=r"radius_m: not within 0\.316 and 50"):
+        changed_task(CircleTask(), {"radius_m": 0.3}, config, State.READY)
+    assert changed_task(CircleTask(), {"radius_m": 0.316}, config, State.READY).radius_m == 0.316
+    with pytest.raises(TaskRefused, match=r"radius_m: 0\.3 m is too small: .*; write at least 0\.316$"):
+        changed_task(CircleTask(radius_m=0.3), {"speed_m_s": 0.1}, config, State.READY)
+
+
 def test_the_limits_are_those_that_are_enforced_by_the_outer_wheel():
     shown = limits(ROBOT, CircleTask())
     assert shown["radius_m"] == RADIUS_M

@@ -5,14 +5,22 @@ import math
 import numpy as np
 import pytest
 
+from disco_hw.config import Robot
 from disco_hw.control.plan import DiscoSettings
 from disco_hw.model import plain as physics
-from disco_hw.tasks.circle import CircleCost, CircleTask
+from disco_hw.tasks.circle import RADIUS_M, CircleCost, CircleTask
 from tests.control import oracle
 from tests.tasks.costs import circle_cost, instant_cost
 from tests.tasks.drives import MEAN, begin_with, drive, planner_for, plant_at
 
 T, STEP_S = 50, 0.1
+GEOMETRY = {
+    "name": "r",
+    "wheel_radius_m": 0.06,
+    "axial_distance_m": 0.31,
+    "ticks_per_rev": 2048,
+    "max_wheel_speed_rad_s": 8.0,
+}
 
 
 def sequence_cost(circle, start, left, right):
@@ -83,6 +91,25 @@ def test_the_horizon_of_half_the_length_no_longer_ends_in_a_trap():
         for _ in drive(planner_for(CircleCost(), DiscoSettings(step_s=0.05)), plant, range(200))
     ]
     assert np.mean(costs[100:]) < 0.12
+
+
+@pytest.mark.parametrize("x_icr_m", [0.238, -0.238])
+def test_a_circle_that_the_tracked_point_cannot_go_round_is_refused_with_the_least_radius(x_icr_m):
+    robot = Robot(**GEOMETRY, x_icr_m=x_icr_m)
+    fault = CircleTask(radius_m=0.25).beyond_robot(robot)
+    assert (fault.field, fault.hint) == ("radius_m", "write at least 0.251")
+    assert "0.25 m is too small" in fault.fault
+    assert CircleTask(radius_m=0.251).beyond_robot(robot) is None
+    assert CircleTask().editable(robot)["radius_m"][:2] == (0.251, RADIUS_M[1])
+    assert CircleTask().editing_note(robot).startswith("Radius 0.251 to 50 m;")
+    # A robot that turns about its tracked point goes round any circle.
+    assert CircleTask(radius_m=0.1, speed_m_s=0.1).beyond_robot(Robot(**GEOMETRY)) is None
+
+
+def test_a_larger_radius_is_offered_only_where_it_helps():
+    robot = Robot(**GEOMETRY)
+    assert CircleTask(speed_m_s=0.45).beyond_robot(robot).hint == "write at most 0.397 m/s, or a larger radius"
+    assert CircleTask(speed_m_s=0.6).beyond_robot(robot).hint == "write at most 0.397 m/s"
 
 
 def test_the_section_gives_cost_and_outline():

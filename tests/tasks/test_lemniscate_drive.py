@@ -26,9 +26,12 @@ def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_pa
     setup = load_setup(robot_file)
     stack = simulated_stack(robot_file=robot_file, start=BodyPose(*setup.config.task.course().start))
     stack.run(1.5)
-    with pytest.raises(TaskRefused, match=r"at most .* m/s, or a larger size"):
-        changed_task(stack.core.task, {"speed_m_s": 3.0}, setup.config, State.READY)
-    changed = changed_task(stack.core.task, {"size_m": 0.6, "speed_m_s": 0.26}, setup.config, State.READY)
+    for speed_m_s, hint in ((0.45, r"at most .* m/s, or a larger size$"), (3.0, r"at most [\d.]+ m/s$")):
+        with pytest.raises(TaskRefused, match=hint):
+            changed_task(stack.core.task, {"speed_m_s": speed_m_s}, stack.core.task_config, State.READY)
+    with pytest.raises(TaskRefused, match=r"size_m: not within 0\.572 and 50"):
+        changed_task(stack.core.task, {"size_m": 0.57}, stack.core.task_config, State.READY)
+    changed = changed_task(stack.core.task, {"size_m": 0.6, "speed_m_s": 0.26}, stack.core.task_config, State.READY)
     stack.core.set_task(changed)
     stack.run(0.5, UserRequest.ARM)
     stack.run(0.02, UserRequest.START)
@@ -44,6 +47,7 @@ def test_a_lemniscate_is_driven_changed_recorded_and_replayed_bit_for_bit(tmp_pa
     shown = status(stack.core, loop_figures(LoopStats()), RecorderStats())["task"]
     assert shown["asked"]["kind"] == "lemniscate"
     assert shown["labels"]["size_m"] == "Size (m)"
+    assert shown["limits"]["size_m"][0] == 0.572
     assert set(shown["limits"]) == {"size_m", "speed_m_s", "center_x_m", "center_y_m"}
     reported = [record for _, tick in stack.recorder.ticks for record in tick if isinstance(record, records.Task)]
     assert [(record.kind, record.settings["size_m"]) for record in reported] == [("lemniscate", 0.6)]

@@ -10,6 +10,7 @@ import msgspec
 import pytest
 
 import disco_hw
+from disco_hw.config import Robot
 from disco_hw.tasks import ReadField, UnknownKind, default_task, kind_of, kinds, task_class, task_from
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.tasks.lemniscate import LemniscateTask
@@ -109,4 +110,12 @@ def test_the_lemniscate_crosses_itself_in_its_middle_and_is_as_large_as_it_says(
     assert (y.min(), y.max()) == pytest.approx((-0.5 - 2.0**-0.5, -0.5 + 2.0**-0.5), abs=1e-3)
     assert task.points()[0] == task.points()[-1] == pytest.approx((1.0, -0.5))
     assert task.course().length_m == pytest.approx(5.2441 * 2.0, rel=1e-3)
+    robot = Robot(
+        name="r", wheel_radius_m=0.06, axial_distance_m=0.31, x_icr_m=-0.2, ticks_per_rev=2048,
+        max_wheel_speed_rad_s=8.0,
+    )  # fmt: skip
+    assert LemniscateTask(size_m=0.48).beyond_robot(robot) is None
+    fault = LemniscateTask(size_m=0.47).beyond_robot(robot)
+    assert (fault.field, fault.hint) == ("size_m", "write at least 0.48")
+    assert task.editable(robot)["size_m"].low == 0.48
     assert "with this size_m the figure reaches" in LemniscateTask(center_x_m=830.0, size_m=10.0).fault().fault

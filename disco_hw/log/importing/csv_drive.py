@@ -223,7 +223,10 @@ def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tupl
         left_angle, right_angle = integrate_angle(t_s, left, segment), integrate_angle(t_s, right, segment)
         return sheet, Wheels(t_s, left_angle, right_angle, left, right, segment, False, bool(t_s.size))
     if ticks_per_rev is None:
-        raise LogError(f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give --robot ROBOT.toml")
+        raise LogError(
+            f"{sheet.name}: {TICKS[0]} needs the ticks of a revolution; give ticks_per_rev (--robot ROBOT.toml on the "
+            "command line)"
+        )
     t_s = sheet.t_s[has_ticks]
     per_rad = ticks_per_rev / (2.0 * math.pi)
     begins = np.concatenate([[True], np.diff(sheet.segment[has_ticks]) != 0])

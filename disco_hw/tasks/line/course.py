@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from disco_hw.errors import InputError
-from disco_hw.tasks import SLOWEST_M_S, Array, Chassis, Editable, Point, too_fast
+from disco_hw.errors import FieldFault, InputError
+from disco_hw.tasks import SLOWEST_M_S, Array, Chassis, Editable, Point, straight_fastest_m_s, too_fast
 from disco_hw.tasks.line import SHARP_RAD, PathTable, Waypoints
 
 if TYPE_CHECKING:
@@ -158,13 +158,8 @@ class PathProgress:
         self._paused = True
 
 
-def straight_fastest_m_s(robot: Chassis) -> float:
-    """Speed straight ahead at which the wheels of the nominal robot are at their limit."""
-    return robot.max_wheel_speed_rad_s * robot.wheel_radius_m
-
-
-def straight_too_fast(speed_m_s: float, robot: Chassis) -> str | None:
-    """Return why the wheels cannot do a speed straight ahead, and the remedy; None if they can."""
+def straight_too_fast(speed_m_s: float, robot: Chassis) -> FieldFault | None:
+    """Return the fault of a speed that the wheels cannot do straight ahead; None if they can."""
     return too_fast(speed_m_s, straight_fastest_m_s(robot), robot, "the wheels")
 
 

@@ -5,13 +5,19 @@ import socket
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Literal
 
 import pytest
 
 import drivers.transport
-from disco_hw.config.robot import Link
+from disco_hw import load_robot
+from disco_hw.config import robot_file
+from disco_hw.config.robot import Link, RobotConfig
+from disco_hw.errors import InputError
+from drivers.motor import motor_drivers
 from drivers.transport import TransportSettingsError, create_transport, media
 from drivers.types import Frame, LinkState
+from tests.drivers.motor.test_motor_drivers import EXAMPLES, robot_toml
 from tests.drivers.transport.links import up
 from tests.drivers.waiting import collect, outgoing, send, wait_until
 
@@ -29,6 +35,24 @@ def _in_the_folder(tmp_path, monkeypatch):
     media.cache_clear()
 
 
+class UdpLink(Link, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`Link` with the kind that the page adds to it."""
+
+    kind: Literal["can", "serial", "udp"] = "can"
+
+
+class UdpRobotConfig(RobotConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """`RobotConfig` with that link."""
+
+    link: UdpLink = UdpLink()
+
+
+@pytest.fixture
+def _in_robot_toml(monkeypatch):
+    """The kind of link as if it stood in disco_hw/config/robot.py."""
+    monkeypatch.setattr(robot_file, "RobotConfig", UdpRobotConfig)
+
+
 @pytest.fixture
 def controller():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
@@ -38,8 +62,9 @@ def controller():
 
 
 @pytest.fixture
-def transport(_in_the_folder, controller):
-    link = Link(kind="udp", channel=f"127.0.0.1:{controller.getsockname()[1]}")
+def transport(tmp_path, _in_the_folder, _in_robot_toml, controller):
+    channel = f"127.0.0.1:{controller.getsockname()[1]}"
+    link = load_robot(robot_toml(tmp_path, f'kind = "udp"\nchannel = "{channel}"')).link
     with closing(create_transport(**link.medium_fields())) as transport:
         transport.open()
         up(transport)
@@ -73,6 +98,17 @@ def test_a_controller_that_goes_and_comes_back_is_a_new_link(transport, controll
         wait_until(lambda: transport.send(outgoing(0x7), time.monotonic_ns()))
         while again.recv(100)[:2] != b"\x07\x00":
             pass
+
+
+@pytest.mark.usefixtures("_in_robot_toml")
+def test_every_driver_that_speaks_over_can_speaks_over_the_medium_and_no_other_does(tmp_path):
+    for name, driver in motor_drivers().items():
+        file = robot_toml(tmp_path, f'driver = "{name}"\nkind = "udp"\n{EXAMPLES[name]}')
+        if "can" in driver.kinds:
+            assert load_robot(file).link.kind == "udp"
+        else:
+            with pytest.raises(InputError, match=f'{name} does not speak over "udp"; write "serial"$'):
+                load_robot(file)
 
 
 @pytest.mark.usefixtures("_in_the_folder")

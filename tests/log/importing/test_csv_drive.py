@@ -111,7 +111,8 @@ def test_a_command_holds_over_a_short_gap_and_is_unknown_over_a_long_one_and_at_
 def test_ticks_need_the_ticks_of_a_revolution(tmp_path):
     lines = [[*line[:3], round(line[0] * 100), round(line[0] * 150), *line[5:]] for line in circle()]
     content = text(lines, TICKS_HEADER)
-    assert "--robot" in refusal(tmp_path, content)
+    hint = "; give ticks_per_rev (--robot ROBOT.toml on the command line)"
+    assert refusal(tmp_path, content).endswith(hint)
     wheels = read(tmp_path, content, ticks_per_rev=200.0).wheels
     assert wheels.angle_measured
     assert not wheels.speed_measured
