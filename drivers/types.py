@@ -271,27 +271,11 @@ class LineQuestions:
 class MotorDriver:
     """A motor controller that robot.toml can name: each file of `drivers.motor` that speaks to one holds a `DRIVER`.
 
-<<<<<<< HEAD
-    `settings`: a struct of its own fields in [link], with `fault()`; those of another driver are refused there.
-    `make` returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the
-    e-stop for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given
-    each frame that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that
-    it holds. `largest_difference_rad_s`: of the wheel speeds, where it limits how fast the robot turns. `cyclic_frames`
-    (of settings, command rate in Hz, whether authenticated): what the link carries.
-    `authenticates`: whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it
-    speaks over, the usual one first. `reports_reception`: whether the controller counts the frames that it rejects and
-    answers for its clock, so that `check` can ask. `exchange` makes what a serial line is spoken with; None: the
-    reference protocol's frames. `serial_field`: of the settings, one that belongs to a serial link, where it must be
-    given, and to no other. `example`: its fields in [link] for a robot as the demonstration drives it; none where its
-    controller is not simulated. `takes_body_speeds`: whether it is given speed and turn rate of the body, and makes
-    wheel speeds of them by a track of its own. `recognise`: of frames that came, the fields in [link] that they show,
-    None if they are not its controller's; where it says nothing by itself, of the replies to `questions` on a serial
-    line. `latches_stop`: whether the controller itself keeps an e-stop until it is reset.
-=======
     `settings`: a struct of its own fields in [link], with `fault()`; those of another driver are refused there. `make`
     returns a fresh driver of these and of the key of authenticated mode (16 bytes) or None. `stop_frames`: the e-stop
     for a connection beside the daemon's, which needs no answer; `stop_confirmation` makes what says, given each frame
     that is heard then, whether the robot has confirmed it. `slowest_rad_s`: the slowest wheel speed that it holds.
+    `largest_difference_rad_s`: of the wheel speeds, where it limits how fast the robot turns.
     `cyclic_frames` (of settings, command rate in Hz, whether authenticated): what the link carries. `authenticates`:
     whether there is such a mode; without one `link.key_file` is refused. `kinds`: of links that it speaks over, the
     usual one first; "can" stands for every medium but "serial". `reports_reception`: whether the controller counts the
@@ -302,7 +286,6 @@ class MotorDriver:
     of the body, and makes wheel speeds of them by a track of its own. `recognise`: of frames that came, the fields in
     [link] that they show, None if they are not its controller's; where it says nothing by itself, of the replies to
     `questions` on a serial line. `latches_stop`: whether the controller itself keeps an e-stop until it is reset.
->>>>>>> pages
     """
 
     name: str

@@ -225,7 +225,8 @@ ALLOWED_CALLS = {
     "disco_hw/viewer/server.py": {"read_bytes"},
     # A directory, to lock it.
     "drivers/kernel_cache.py": {"os.open"},
-    "drivers/transport/can.py": {"read_text"},
+    # A serial port, to lock it.
+    "drivers/transport/can.py": {"read_text", "os.open"},
     "sim/fault_schedule.py": {"tomllib.loads"},
     "sim/serial_line.py": {"os.open"},
 }
