@@ -160,8 +160,9 @@ class Gamepad:
 def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepad:
     """Open the gamepad at `path`, or the first one that has the axes and the button; raises GamepadError."""
     evdev = _evdev()
-    axes = {code for code, _ in map(_axis, (mapping.forward_axis, mapping.left_axis))}
-    button = _code(mapping.deadman_button, "BTN_")
+    needed = {name: (_EV_ABS, _axis(name)[0]) for name in (mapping.forward_axis, mapping.left_axis)}
+    needed[mapping.deadman_button] = _EV_KEY, _code(mapping.deadman_button, "BTN_")
+    unfit = []
     for candidate in [path] if path else evdev.list_devices(writable=False):
         try:
             device = evdev.InputDevice(candidate)
@@ -173,13 +174,18 @@ def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepa
                     f"{path}: cannot be opened ({error.strerror}); check that it is plugged in and that you may read it"
                 ) from None
             continue
-        if axes <= set(found.get(_EV_ABS, ())) and button in found.get(_EV_KEY, ()):
+        lacking = [name for name, (kind, code) in needed.items() if code not in found.get(kind, ())]
+        if not lacking:
             return Gamepad(device, mapping, now_ns)
         device.close()
+        # What has none of them is a keyboard, or a button of the computer.
+        if path or len(lacking) < len(needed):
+            unfit.append(f"{candidate} ({device.name}) lacks {', '.join(lacking)}")
     if path:
+        raise GamepadError(f"{unfit[0]}; change the [drive] section of robot.toml")
+    if unfit:
         raise GamepadError(
-            f"{path}: lacks {mapping.forward_axis}, {mapping.left_axis} or {mapping.deadman_button}; change the "
-            "[drive] section of robot.toml"
+            f"no gamepad found: {'; '.join(unfit)}; plug one in, or change the [drive] section of robot.toml"
         )
     raise GamepadError("no gamepad found; plug one in, and let its user read /dev/input (group input)")
 

@@ -205,6 +205,40 @@ def test_without_a_device_one_line_says_what_to_do(tmp_path):
             open_gamepad(GamepadMapping(), 0)
 
 
+def test_pads_that_do_not_fit_are_named_with_what_they_lack(monkeypatch):
+    found = {
+        "/dev/input/event1": ("a keyboard", {ecodes.EV_KEY: [ecodes.KEY_A]}),
+        "/dev/input/event7": (
+            "Dual Action", {ecodes.EV_KEY: [ecodes.BTN_TRIGGER], ecodes.EV_ABS: [ecodes.ABS_X, ecodes.ABS_Y]}
+        ),
+        "/dev/input/event8": ("buttons", {ecodes.EV_KEY: [ecodes.BTN_TL]}),
+    }  # fmt: skip
+
+    class Plugged:
+        def __init__(self, path):
+            self.name, self._capabilities = found[path]
+
+        def capabilities(self, absinfo):
+            return self._capabilities
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(evdev, "list_devices", lambda writable: list(found))
+    monkeypatch.setattr(evdev, "InputDevice", Plugged)
+    with pytest.raises(GamepadError) as refused:
+        open_gamepad(GamepadMapping(), 0)
+    assert str(refused.value) == (
+        "no gamepad found: /dev/input/event7 (Dual Action) lacks BTN_TL; /dev/input/event8 (buttons) lacks "
+        "-ABS_Y, -ABS_X; plug one in, or change the [drive] section of robot.toml"
+    )
+    with pytest.raises(GamepadError, match=r"event1 \(a keyboard\) lacks -ABS_Y, -ABS_X, BTN_TL; change .*\[drive\]"):
+        open_gamepad(GamepadMapping(), 0, "/dev/input/event1")
+    del found["/dev/input/event7"], found["/dev/input/event8"]
+    with pytest.raises(GamepadError, match="no gamepad found; plug one in, and let its user read"):
+        open_gamepad(GamepadMapping(), 0)
+
+
 def test_a_device_that_goes_while_it_is_looked_at_is_passed_over(monkeypatch):
     class Going:
         def __init__(self, _path):
