@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 # linux/input-event-codes.h.
 _EV_SYN, _EV_KEY, _EV_ABS = 0, 1, 3
 _SYN_REPORT, _SYN_DROPPED = 0, 3
+# Chosen: more than a worn stick has at rest beyond its dead zone; a trigger at rest has 1.
+_LARGEST_AT_REST = 0.2
 
 
 class GamepadError(Exception):
@@ -47,11 +49,15 @@ class GamepadState:
 class Gamepad:
     """A gamepad that is open; `poll()` it in each tick.
 
+    The deadman counts from a press with both axes at rest on: a trigger, or a stick that is held, is no sudden full
+    speed. `refusal` says why the last press did not count; empty if it did.
+
     Raises GamepadError for a mapping with names that the device does not have.
     """
 
     def __init__(self, device: InputDevice[str], mapping: GamepadMapping, now_ns: int) -> None:
         self._device = device
+        self.refusal = ""
         self._dead_zone = mapping.dead_zone
         self._forward = _axis(mapping.forward_axis)
         self._left = _axis(mapping.left_axis)
@@ -62,10 +68,13 @@ class Gamepad:
         self._event_ns = now_ns
         self._dropping = False
         self._gone = False
+        self._names = tuple(name.removeprefix("-") for name in (mapping.forward_axis, mapping.left_axis))
         try:
             self._read_state()
         except OSError as error:
             raise GamepadError(f"{device.name}: cannot be read ({error.strerror}); plug it in again") from None
+        self._was_held = self._deadman
+        self._were_off = self._axes_off_rest()
 
     @property
     def name(self) -> str:
@@ -88,7 +97,8 @@ class Gamepad:
             self._gone = True
         if self._gone:
             return None
-        return GamepadState(self._event_ns, self._value(self._forward), self._value(self._left), self._deadman)
+        held = self._deadman and not self.refusal
+        return GamepadState(self._event_ns, self._value(self._forward), self._value(self._left), held)
 
     def close(self) -> None:
         """Close the gamepad's device."""
@@ -96,9 +106,11 @@ class Gamepad:
 
     def _handle(self, event: InputEvent) -> None:
         if event.type == _EV_SYN:
-            if self._dropping and event.code == _SYN_REPORT:
-                self._dropping = False
-                self._read_state()
+            if event.code == _SYN_REPORT:
+                if self._dropping:
+                    self._dropping = False
+                    self._read_state()
+                self._judge_press()
             # The kernel's queue ran over: what comes until the next report is of no use.
             self._dropping = self._dropping or event.code == _SYN_DROPPED
         elif self._dropping:
@@ -107,6 +119,24 @@ class Gamepad:
             self._deadman = event.value != 0
         elif event.type == _EV_ABS and event.code in self._raw:
             self._raw[event.code] = self._share(event.code, event.value)
+
+    def _judge_press(self) -> None:
+        """Refuse a press of the deadman with an axis off its middle, both before and after the report that has it.
+
+        Before the first report of some pads the kernel has 0 for an axis, which may be its end.
+        """
+        off = self._axes_off_rest()
+        if self._deadman and not self._was_held:
+            names = ", ".join(name for name in off if name in self._were_off)
+            self.refusal = names and (
+                f"{names} off the middle when the deadman was pressed; let go of the sticks and press again; "
+                "for a trigger choose a stick in the [drive] section of robot.toml"
+            )
+        self._was_held, self._were_off = self._deadman, off
+
+    def _axes_off_rest(self) -> tuple[str, ...]:
+        axes = zip(self._names, (self._forward, self._left), strict=True)
+        return tuple(name for name, axis in axes if abs(self._value(axis)) > _LARGEST_AT_REST)
 
     def _read_state(self) -> None:
         for code, _ in (self._forward, self._left):
@@ -130,8 +160,9 @@ class Gamepad:
 def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepad:
     """Open the gamepad at `path`, or the first one that has the axes and the button; raises GamepadError."""
     evdev = _evdev()
-    axes = {code for code, _ in map(_axis, (mapping.forward_axis, mapping.left_axis))}
-    button = _code(mapping.deadman_button, "BTN_")
+    needed = {name: (_EV_ABS, _axis(name)[0]) for name in (mapping.forward_axis, mapping.left_axis)}
+    needed[mapping.deadman_button] = _EV_KEY, _code(mapping.deadman_button, "BTN_")
+    unfit = []
     for candidate in [path] if path else evdev.list_devices(writable=False):
         try:
             device = evdev.InputDevice(candidate)
@@ -143,13 +174,18 @@ def open_gamepad(mapping: GamepadMapping, now_ns: int, path: str = "") -> Gamepa
                     f"{path}: cannot be opened ({error.strerror}); check that it is plugged in and that you may read it"
                 ) from None
             continue
-        if axes <= set(found.get(_EV_ABS, ())) and button in found.get(_EV_KEY, ()):
+        lacking = [name for name, (kind, code) in needed.items() if code not in found.get(kind, ())]
+        if not lacking:
             return Gamepad(device, mapping, now_ns)
         device.close()
+        # What has none of them is a keyboard, or a button of the computer.
+        if path or len(lacking) < len(needed):
+            unfit.append(f"{candidate} ({device.name}) lacks {', '.join(lacking)}")
     if path:
+        raise GamepadError(f"{unfit[0]}; change the [drive] section of robot.toml")
+    if unfit:
         raise GamepadError(
-            f"{path}: lacks {mapping.forward_axis}, {mapping.left_axis} or {mapping.deadman_button}; change the "
-            "[drive] section of robot.toml"
+            f"no gamepad found: {'; '.join(unfit)}; plug one in, or change the [drive] section of robot.toml"
         )
     raise GamepadError("no gamepad found; plug one in, and let its user read /dev/input (group input)")
 

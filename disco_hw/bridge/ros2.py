@@ -272,8 +272,11 @@ class Bridge:
         refused = ros2_commands.refusal(request, self._config.ros2.may_move, age_ns)
         if refused is not None:
             reply = {"do": request, "ok": False, "error": refused}
-        elif request == "arm" and self._is_hand_driven():
-            refusal = self._speeds.permit(time.monotonic_ns())
+        elif request == "arm" and "drive" in (status := self._request_status()):
+            if status["state"] in {"READY", "ARMED"}:
+                refusal = self._speeds.permit(time.monotonic_ns())
+            else:
+                refusal = f"the robot is in state {status['state']}: {status['detail']}"
             reply = {"do": request, "ok": refusal is None, "text": "cmd_vel drives"}
             if refusal is not None:
                 reply = {"do": request, "ok": False, "error": refusal}
@@ -283,10 +286,11 @@ class Bridge:
             reply = ros2_commands.request_daemon(self._setup.robot_file, request, self._link)
         self._publish(REPLY, msg.String(json.dumps(reply)))
 
-    def _is_hand_driven(self) -> bool:
+    def _request_status(self) -> dict[str, Any]:
+        """Return the daemon's status, empty if it does not answer."""
         with contextlib.suppress(WorkError):
-            return "drive" in send_request(socket_path(self._config), {"do": "status"})
-        return False
+            return send_request(socket_path(self._config), {"do": "status"})
+        return {}
 
     def _diagnosis(self, mono_ns: int, wall_ns: int) -> out.Message:
         """Return the topic and the message of the bridge's diagnostics."""

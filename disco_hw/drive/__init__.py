@@ -112,7 +112,8 @@ class GamepadSource:
         """Text for the operator on what to hold, or to plug in."""
         if self._pad is None:
             return f"{self._name} is disconnected; plug it in again"
-        return f"{self._name}: hold the deadman's button; Ctrl-C ends"
+        advice = self._pad.refusal or "hold the deadman's button; Ctrl-C ends"
+        return f"{self._name}: {advice}"
 
     def poll(self, now_ns: int, _robot: RobotView) -> ManualInput | None:
         """Return the sticks and the deadman now; None while the device is gone."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import time
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
@@ -26,6 +27,10 @@ from disco_hw.processes import DescriptorReserve
 from disco_hw.runtime import advice, is_estop, next_step, status_headline
 
 REQUESTS = ("arm", "start", "stop", "disarm", "reset", "task")
+# These slow or stop the robot, so they are done however late they come.
+_ALWAYS = ("stop", "disarm")
+# Chosen: as long as the page takes to show NO CONNECTION.
+_OLDEST_STATUS_S = 1.5
 # Chosen: the buttons follow the robot's state within it.
 STATUS_S = 0.25
 # Chosen: the daemon answers within a tick; an operator must see soon that it does not.
@@ -156,13 +161,28 @@ class Desk:
         if request["do"] == "estop":
             reply = await asyncio.shield(loop.run_in_executor(self._stopping, self.estop))
         elif request["do"] in REQUESTS:
-            reply = await asyncio.shield(loop.run_in_executor(self._asking, self.request, request))
+            reply = await asyncio.shield(loop.run_in_executor(self._asking, self._request_in_time, request))
         else:
             reply = {"do": request["do"], "ok": False, "error": "this page has no such request"}
         try:
             await send({**reply, "kind": "reply"})
         except ConnectionClosed:
             return
+
+    def _request_in_time(self, request: dict[str, Any]) -> dict[str, Any]:
+        """Send a page's request to the daemon; what may move the robot only soon after the newest status it has seen.
+
+        A stalled network delivers a click when it flows again, when nobody expects that the robot moves.
+        """
+        now_s, stamp_s = time.monotonic(), request.pop("stamp", None)
+        is_prompt = isinstance(stamp_s, int | float) and now_s - _OLDEST_STATUS_S <= stamp_s <= now_s
+        if not is_prompt and request["do"] not in _ALWAYS:
+            error = (
+                f"the page's status of the robot was over {_OLDEST_STATUS_S} s old when this arrived, so nothing was "
+                "done; check the network, then press again"
+            )
+            return {"do": request["do"], "ok": False, "error": error}
+        return self.request(request)
 
     def request(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Send one request to the daemon; the answer says what went wrong, nothing is raised."""
@@ -216,7 +236,7 @@ class Desk:
         """Send the browser the status; also how it notices that nobody is here any more."""
         while True:
             try:
-                drawing = {"dark": self.dark, "draft": self.draft, "drags": self._drags}
+                drawing = {"stamp": time.monotonic(), "dark": self.dark, "draft": self.draft, "drags": self._drags}
                 await send({**shown(self.status, self.error), **drawing})
             except ConnectionClosed:
                 return

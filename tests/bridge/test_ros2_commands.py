@@ -1,12 +1,14 @@
 """Speeds, requests and e-stops from ROS: what may move the robot, and what is refused for which reason."""
 
 import itertools
+import json
 import math
 import os
 import random
 import threading
 import time
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,7 +19,7 @@ from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 
-from disco_hw.bridge import ros2_commands
+from disco_hw.bridge import ros2, ros2_commands
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import LATCHED, RELIABLE, SENSOR, Bridge, TopicReaders, UnreadCounts
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
@@ -230,6 +232,23 @@ def test_a_late_request_is_refused_with_a_reply_and_a_late_stop_is_passed_on(tmp
     assert passed == ["stop", "start", "stop"]
     assert len(replies) == 4
     assert "sent over 1 s ago" in replies[0]
+
+
+def test_arming_a_manual_drive_is_refused_unless_the_robot_can_be_armed(tmp_path, monkeypatch):
+    file, replies, status = robot_file(tmp_path), [], {"ok": True, "detail": "e-stop; reset it", "drive": {}}
+    file.write_text(file.read_text(encoding="utf-8") + "[ros2]\nmay_move = true\n", encoding="utf-8")
+    monkeypatch.setattr(ros2, "send_request", lambda _, __: status)
+    # Without a domain of DDS, which takes a second to join.
+    bridge = Bridge.__new__(Bridge)
+    bridge._config = load_setup(file).config
+    bridge._speeds = SimpleNamespace(permit=lambda _: None)
+    bridge._publish = lambda _, reply: replies.append(json.loads(reply.data))
+    for state in State:
+        status["state"] = state.name
+        bridge._reply_to(time.time_ns(), "arm")
+    refused = {state.name: reply["error"] for state, reply in zip(State, replies, strict=True) if not reply["ok"]}
+    assert set(refused) == {"DISCONNECTED", "HANDSHAKE", "STOPPING", "FAULT"}
+    assert refused["FAULT"] == "the robot is in state FAULT: e-stop; reset it"
 
 
 def qualities(reliable, latched=False):

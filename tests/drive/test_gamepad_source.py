@@ -16,6 +16,7 @@ class Pad:
     """Stands for an open gamepad."""
 
     name = "pad"
+    refusal = ""
 
     def __init__(self):
         self.state, self.closed = GamepadState(0, 0.0, 0.0, False), False
@@ -65,6 +66,13 @@ def test_what_is_held_still_stays_new_until_the_silence_is_too_long():
     assert bench.poll(GamepadState(0, 0.0, 0.0, False), ms=60_000).t_ns == bench.now_ns
     bench = Bench(silence_s=0.0)
     assert bench.poll(GamepadState(0, 1.0, 0.0, True), ms=60_000).t_ns == bench.now_ns
+
+
+def test_a_press_that_does_not_count_is_said():
+    bench = Bench()
+    assert "hold the deadman" in bench.source.status_text
+    bench.pad.refusal = "let go of the stick"
+    assert bench.source.status_text == "pad: let go of the stick"
 
 
 def test_a_gone_pad_is_closed_and_looked_for_once_a_second():

@@ -93,6 +93,54 @@ def test_what_is_held_at_the_start_is_known(device):
     assert state.forward == pytest.approx(1.0)
 
 
+def test_a_press_while_an_axis_is_off_its_middle_does_not_count(device, pad):
+    device.send(stick(ecodes.ABS_Y, LOW))
+    device.send(button(1))
+    assert pad.poll(1).deadman is False
+    assert "ABS_Y off the middle" in pad.refusal
+    device.send(stick(ecodes.ABS_Y, 0))
+    assert pad.poll(2).deadman is False, "only a new press counts"
+    device.send(button(0))
+    device.send(button(1))
+    device.send(stick(ecodes.ABS_Y, LOW))
+    state = pad.poll(3)
+    assert (state.forward, state.deadman, pad.refusal) == (pytest.approx(1.0), True, "")
+
+
+class TriggerPad(PipedPad):
+    """A pad whose ABS_RZ is a trigger: 0 to 255, at rest 0."""
+
+    def absinfo(self, code):
+        return AbsInfo(0, 0, 255, 0, 0, 0) if code == ecodes.ABS_RZ else super().absinfo(code)
+
+
+def test_a_trigger_at_rest_is_no_full_speed():
+    device = TriggerPad()
+    pad = Gamepad(device, GamepadMapping(forward_axis="-ABS_RZ"), 0)
+    for value in (0, 255, 0):
+        device.send(stick(ecodes.ABS_RZ, value))
+        device.send(button(1))
+        assert pad.poll(1).deadman is False
+        assert "ABS_RZ off the middle" in pad.refusal
+        assert "for a trigger choose a stick in the [drive] section of robot.toml" in pad.refusal
+        device.send(button(0))
+    device.close()
+
+
+def test_an_axis_that_the_kernel_knows_only_from_the_first_report_is_judged_by_that(device):
+    device.axes[ecodes.ABS_Y] = LOW
+    pad = Gamepad(device, GamepadMapping(), 0)
+    device.send(button(1), stick(ecodes.ABS_Y, 0))
+    assert pad.poll(1).deadman
+
+
+def test_a_press_that_was_lost_in_an_overrun_is_judged_too(device, pad):
+    device.send(stick(ecodes.ABS_X, LOW))
+    device.keys, device.axes[ecodes.ABS_X] = [ecodes.BTN_TL], LOW
+    device.send((ecodes.EV_SYN, ecodes.SYN_DROPPED, 0))
+    assert pad.poll(1).deadman is False
+
+
 def test_a_tap_within_one_poll_leaves_the_deadman_open(device, pad):
     device.send(button(1), button(0))
     assert pad.poll(1).deadman is False
@@ -155,6 +203,40 @@ def test_without_a_device_one_line_says_what_to_do(tmp_path):
     if not evdev.list_devices():
         with pytest.raises(GamepadError, match="no gamepad found"):
             open_gamepad(GamepadMapping(), 0)
+
+
+def test_pads_that_do_not_fit_are_named_with_what_they_lack(monkeypatch):
+    found = {
+        "/dev/input/event1": ("a keyboard", {ecodes.EV_KEY: [ecodes.KEY_A]}),
+        "/dev/input/event7": (
+            "Dual Action", {ecodes.EV_KEY: [ecodes.BTN_TRIGGER], ecodes.EV_ABS: [ecodes.ABS_X, ecodes.ABS_Y]}
+        ),
+        "/dev/input/event8": ("buttons", {ecodes.EV_KEY: [ecodes.BTN_TL]}),
+    }  # fmt: skip
+
+    class Plugged:
+        def __init__(self, path):
+            self.name, self._capabilities = found[path]
+
+        def capabilities(self, absinfo):
+            return self._capabilities
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(evdev, "list_devices", lambda writable: list(found))
+    monkeypatch.setattr(evdev, "InputDevice", Plugged)
+    with pytest.raises(GamepadError) as refused:
+        open_gamepad(GamepadMapping(), 0)
+    assert str(refused.value) == (
+        "no gamepad found: /dev/input/event7 (Dual Action) lacks BTN_TL; /dev/input/event8 (buttons) lacks "
+        "-ABS_Y, -ABS_X; plug one in, or change the [drive] section of robot.toml"
+    )
+    with pytest.raises(GamepadError, match=r"event1 \(a keyboard\) lacks -ABS_Y, -ABS_X, BTN_TL; change .*\[drive\]"):
+        open_gamepad(GamepadMapping(), 0, "/dev/input/event1")
+    del found["/dev/input/event7"], found["/dev/input/event8"]
+    with pytest.raises(GamepadError, match="no gamepad found; plug one in, and let its user read"):
+        open_gamepad(GamepadMapping(), 0)
 
 
 def test_a_device_that_goes_while_it_is_looked_at_is_passed_over(monkeypatch):

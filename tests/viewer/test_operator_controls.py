@@ -107,7 +107,7 @@ def hung_up(line):
 
 
 def request_reply(line, **request):
-    line.send(json.dumps(request))
+    line.send(json.dumps({"stamp": time.monotonic(), **request}))
     return next_message(line, "drive" if request["do"] == "drive" else "reply")
 
 
@@ -120,6 +120,20 @@ def test_every_button_asks_the_daemon_and_tells_its_answer(daemon, line):
     assert daemon.actions("status", "drive") == list(desk_module.REQUESTS)
     request_reply(line, do="task", radius_m=0.5, speed_m_s=0.1)
     assert ("task", {"radius_m": 0.5, "speed_m_s": 0.1}) in daemon.received
+
+
+def test_what_may_move_the_robot_is_refused_once_it_is_late_and_a_stop_never_is(daemon, line):
+    for stamp in (time.monotonic() - 2.0, time.monotonic() + 100.0, 10**400, None, "0"):
+        replies = {action: request_reply(line, do=action, stamp=stamp) for action in desk_module.REQUESTS}
+        assert {action for action, reply in replies.items() if reply["ok"]} == {"stop", "disarm"}
+        for action in ("arm", "start", "reset", "task"):
+            assert "over 1.5 s old" in replies[action]["error"]
+            assert replies[action]["do"] == action
+    assert set(daemon.actions("status")) == {"stop", "disarm"}
+
+
+def test_the_stamp_of_a_status_makes_a_request_a_prompt_one(line):
+    wait_until(lambda: request_reply(line, do="start", stamp=next_message(line, "status")["stamp"])["ok"], 30.0)
 
 
 def test_what_is_no_request_of_the_page_does_not_reach_the_daemon(daemon, port, line):
@@ -175,7 +189,7 @@ def test_the_estop_is_not_behind_requests_that_hang(line, monkeypatch):
     monkeypatch.setattr(Desk, "request", lambda self, request: {"ok": released.wait(120.0)})
     monkeypatch.setattr(Desk, "estop", lambda self: stopped.set() or {"do": "estop", "ok": True, "text": "stopped"})
     for _ in range(20):
-        line.send(json.dumps({"do": "start"}))
+        line.send(json.dumps({"do": "start", "stamp": time.monotonic()}))
     line.send(json.dumps({"do": "estop"}))
     try:
         assert stopped.wait(60.0)
