@@ -194,6 +194,8 @@ class Keyboard:
         raw[0] &= ~termios.IXON
         raw[3] &= ~(termios.ICANON | termios.ECHO)
         raw[6][termios.VMIN], raw[6][termios.VTIME] = 1, 0
+        # Ctrl-Z would freeze the daemon, and leave the terminal as it is.
+        raw[6][termios.VSUSP] = b"\0"
         # Keys typed before this moment were meant for somebody else.
         termios.tcsetattr(descriptor, termios.TCSAFLUSH, raw)
         self._wake_in, self._wake_out = os.pipe()

@@ -146,6 +146,13 @@ def test_ctrl_d_ends(terminal):
     assert not terminal.poll(100).deadman
 
 
+def test_ctrl_z_stops_the_robot_and_not_the_daemon(terminal):
+    assert termios.tcgetattr(terminal.slave)[6][termios.VSUSP] == b"\0"
+    terminal.hold()
+    assert not terminal.type(b"\x1a").deadman
+    assert terminal.keyboard.ended is None
+
+
 def test_keys_count_from_when_they_came_not_from_when_they_are_polled(terminal):
     terminal.hold()
     os.write(terminal.master, b"w")
