@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from disco_hw.drive import ManualInput, ManualSource, RobotView
+from disco_hw.drive import INPUT_LIMIT_NS, ManualInput, ManualSource, RobotView
 from disco_hw.drive.script import (
     STANDING,
     Array,
@@ -155,7 +155,13 @@ class FittedScriptSource:
         playing = self._playing
         if playing is None:
             self._fit(self._script, robot)
-            return ManualInput(now_ns, 0.0, 0.0, deadman=False)
+            # One that presses by itself once the robot is ready must wait for the script, too.
+            held = self._deadman.poll(now_ns, replace(robot, state=State.HANDSHAKE))
+            if held is None:
+                return None
+            # Held now, it is neither pressed nor open: too old an input is no release, after which a press would count.
+            t_ns = held.t_ns - INPUT_LIMIT_NS - 1 if held.deadman else held.t_ns
+            return ManualInput(t_ns, 0.0, 0.0, deadman=False)
         if self._fitting is None and self._leads_out(playing, robot):
             self._fitting = self._begin_fit(Script(self._script.name, playing.remaining), robot)
         if self._fitting is not None:

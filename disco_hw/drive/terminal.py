@@ -41,12 +41,15 @@ _RELEASE_NS = 500_000_000
 _MAX_IGNORED_EVENTS = 10
 # No hand and no terminal repeats faster; pasted text does.
 _SHORTEST_REPEAT_NS = 10_000_000
+# Chosen: terminals repeat a key every 30 ms, so a read that is late by less finds two. A notch of a mouse wheel, which
+# tmux gets as arrow keys, is three or more; what a stalled connection delivers late soon is, too.
+_MOST_REPEATS = 2
 
 DIRECTIONS = {
     b"\x1b[A": (1.0, 0.0), b"\x1b[B": (-1.0, 0.0), b"\x1b[D": (0.0, 1.0), b"\x1b[C": (0.0, -1.0),
     b"\x1bOA": (1.0, 0.0), b"\x1bOB": (-1.0, 0.0), b"\x1bOD": (0.0, 1.0), b"\x1bOC": (0.0, -1.0),
     b"w": (1.0, 0.0), b"x": (-1.0, 0.0), b"a": (0.0, 1.0), b"d": (0.0, -1.0),
-    b"q": (1.0, 0.5), b"e": (1.0, -0.5), b"z": (-1.0, -0.5), b"c": (-1.0, 0.5),
+    b"q": (1.0, 0.5), b"e": (1.0, -0.5), b"z": (-1.0, 0.5), b"c": (-1.0, -0.5),
     b" ": (0.0, 0.0), b"s": (0.0, 0.0),
 }  # fmt: skip
 HELP = (
@@ -82,8 +85,9 @@ class KeyHold:
     """Turns key events into wheel speeds and a deadman.
 
     Held: an event of a driving key less than 200 ms after the one before. The first repeat may come later, so a tap
-    holds nothing, nor does pasted text, which comes faster than any repeat. After a hold has ended, half a second
-    without any key must pass before the next one counts. Holding another key changes the direction; where the terminal
+    holds nothing, nor does pasted text, which comes faster than any repeat. Only a key that was read alone begins a
+    hold, and more than two that were read at once end it. After a hold has ended, half a second without any key must
+    pass before the next one counts. Holding another key changes the direction; where the terminal
     waits longer than 200 ms before it repeats that one, the hold ends.
     """
 
@@ -106,10 +110,10 @@ class KeyHold:
         lapsed = "; release all keys for half a second" if self._state is _Hold.LAPSED else ""
         return f"keyboard, {self._share:.0%} speed{lapsed}"
 
-    def press(self, t_ns: int, key: bytes) -> None:
-        """Take in the newest key of those that came together."""
-        if key in DIRECTIONS:
-            self._state = self._after(t_ns)
+    def press(self, t_ns: int, key: bytes, count: int = 1) -> None:
+        """Take in one of the `count` keys that one read has returned, which stands for all of them."""
+        if key in DIRECTIONS and count <= _MOST_REPEATS:
+            self._state = self._after(t_ns, count)
             self._direction = DIRECTIONS[key]
         else:
             self._state = _Hold.LAPSED
@@ -132,11 +136,11 @@ class KeyHold:
         left, right = wheel_speeds(forward * self._share, turn * self._share, self._top_rad_s)
         return ManualInput(self._last_ns, left, right, deadman=True)
 
-    def _after(self, t_ns: int) -> _Hold:
-        """Return the state after a driving key at `t_ns`."""
+    def _after(self, t_ns: int, count: int) -> _Hold:
+        """Return the state after a read of so many driving keys at `t_ns`."""
         gap_ns = _FIRST_REPEAT_NS if self._last_ns is None else t_ns - self._last_ns
         match self._state:
-            case _Hold.PRESSED if gap_ns < _SHORTEST_REPEAT_NS:
+            case _Hold.PRESSED if gap_ns < _SHORTEST_REPEAT_NS or count > 1:
                 return _Hold.PRESSED
             case _Hold.HELD | _Hold.PRESSED if gap_ns <= INPUT_LIMIT_NS:
                 return _Hold.HELD
@@ -190,6 +194,8 @@ class Keyboard:
         raw[0] &= ~termios.IXON
         raw[3] &= ~(termios.ICANON | termios.ECHO)
         raw[6][termios.VMIN], raw[6][termios.VTIME] = 1, 0
+        # Ctrl-Z would freeze the daemon, and leave the terminal as it is.
+        raw[6][termios.VSUSP] = b"\0"
         # Keys typed before this moment were meant for somebody else.
         termios.tcsetattr(descriptor, termios.TCSAFLUSH, raw)
         self._wake_in, self._wake_out = os.pipe()
@@ -238,23 +244,21 @@ class Keyboard:
             termios.tcsetattr(self._descriptor, termios.TCSANOW, former)
 
     def _handle(self, now_ns: int) -> None:
-        """Act on what has arrived: one event in all, which keeps a poll short however much was typed."""
-        keys: list[bytes] = []
-        t_ns = now_ns
+        """Act on what has arrived: one event for each read, which keeps a poll short however much was typed."""
         while self._arrived and self.ended is None:
             t_ns, data = self._arrived.popleft()
+            keys = parse(data)
             if not data:
                 self._gone, self.ended = True, "the terminal was closed"
-            keys += parse(data)
-            if b"\x04" in keys:
+            elif b"\x04" in keys:
                 self.ended = "the operator ended the drive at the keyboard"
-        if keys and self.ended is None:
-            # Any other key among them wins: it means stop.
-            odd = [key for key in keys if key not in DIRECTIONS]
-            answers = "".join(key.decode("ascii", "ignore") for key in odd if len(key) == 1 and key.isalnum())
-            self._typed = (self._typed + answers)[-_MOST_TYPED:]
-            # What came after this tick began counts as of its beginning.
-            self._hold.press(min(t_ns, now_ns), odd[-1] if odd else keys[-1])
+            else:
+                # Any other key among them wins: it means stop.
+                odd = [key for key in keys if key not in DIRECTIONS]
+                answers = "".join(key.decode("ascii", "ignore") for key in odd if len(key) == 1 and key.isalnum())
+                self._typed = (self._typed + answers)[-_MOST_TYPED:]
+                # What came after this tick began counts as of its beginning.
+                self._hold.press(min(t_ns, now_ns), odd[-1] if odd else keys[-1], len(keys))
 
     def _read(self) -> None:
         """Wait for keys until there is no terminal, or `close()`; the thread's work."""

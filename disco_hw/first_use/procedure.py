@@ -427,7 +427,8 @@ class CommissionPilot:
         events = [*self._messages, *([verdict.event] if verdict.event is not None else []), *self._new_prompt()]
         self._messages.clear()
         requests = verdict.requests
-        if isinstance(action, Reset) and state is State.FAULT:
+        # What a person has stopped, a person alone may reset.
+        if isinstance(action, Reset) and state is State.FAULT and last is not None and not last.output.estop:
             requests = (*requests, UserRequest.RESET)
         return PilotTick(requests, motion, tuple(events))
 
@@ -445,6 +446,11 @@ class CommissionPilot:
         )
         if self._fault_ns is not None and now_ns - self._fault_ns > _FAULT_NS:
             self.fault_text = tick.output.detail
+        if tick.output.estop:
+            # How wheels stop now shows no watchdog. The e-stop must go on being sent until the robot has confirmed it.
+            if fault and not tick.output.send_estop:
+                self.fault_text = tick.output.detail
+            return
         self.procedure.see(
             Seen(now_ns, self._driving, commanded, tick.readings.wheels, tick.readings.poses, fault, silent, self._held)
         )

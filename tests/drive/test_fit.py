@@ -12,7 +12,17 @@ import pytest
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.drive import ManualInput, RobotView, fit
 from disco_hw.drive.fit import FittedScriptSource, ScriptDoesNotFit, fit_script
-from disco_hw.drive.script import Manoeuvre, RobotModel, Room, Script, ScriptSource, driven_path, room_needed
+from disco_hw.drive.hand_pilot import Deadman
+from disco_hw.drive.script import (
+    Manoeuvre,
+    RobotModel,
+    Room,
+    Script,
+    ScriptSource,
+    Unattended,
+    driven_path,
+    room_needed,
+)
 from disco_hw.drive.scripts import create_script
 from disco_hw.estimation.odometry import OdometryParameters, Pose, arc, moved
 from disco_hw.fence import Circle, Fence, Footprint
@@ -140,9 +150,10 @@ class AlwaysPressed:
     completed = False
     status_text = "held"
     task = ""
+    deadman = True
 
     def poll(self, now_ns, robot):
-        return ManualInput(now_ns, 0.0, 0.0, deadman=True)
+        return ManualInput(now_ns, 0.0, 0.0, self.deadman)
 
     def close(self):
         pass
@@ -285,6 +296,46 @@ def test_the_deadman_is_open_until_the_script_fits():
     assert [False, True] in [list(pair) for pair in pairwise(deadman_states)]
     assert deadman_states[-1]
     assert fits.ended is None
+
+
+def test_a_deadman_held_before_the_script_fits_is_no_press():
+    held_ns, deadman = 0, Deadman()
+    fits = source(Fence(keep_in=Circle((0, 0), 9.0)), straight())
+
+    def verdicts(ticks, pose):
+        nonlocal held_ns
+        for _ in range(ticks):
+            held_ns += 20_000_000
+            view = RobotView(State.READY, False, pose=pose)
+            yield deadman.step(held_ns, fits.poll(held_ns, view), State.READY)
+
+    assert not [verdict for verdict in verdicts(50, None) if verdict.requests]
+    assert not [verdict for verdict in verdicts(50, CENTER) if verdict.requests]
+    fits._deadman.deadman = False
+    assert not [verdict for verdict in verdicts(2, CENTER) if verdict.requests]
+    fits._deadman.deadman = True
+    assert [verdict for verdict in verdicts(2, CENTER) if verdict.requests]
+
+
+def test_a_deadman_that_ends_while_a_pose_is_waited_for_ends_the_script():
+    fits = source(Fence(keep_in=Circle((0, 0), 9.0)), straight())
+    polls = []
+    fits._deadman.poll = lambda now_ns, _robot: polls.append(now_ns)
+    assert fits.poll(0, RobotView(State.READY, False)) is None
+    assert polls == [0]
+    fits._deadman.ended = "the operator ended the drive at the keyboard"
+    assert fits.ended == "the operator ended the drive at the keyboard"
+
+
+def test_without_a_person_the_deadman_is_pressed_once_the_script_fits():
+    fits, deadman, armed = source(Fence(keep_in=Circle((0, 0), 9.0)), straight()), Deadman(), []
+    fits._deadman = Unattended()
+    for tick in range(600):
+        # Longer than it may stand once it is pressed.
+        view = RobotView(State.READY, False, pose=CENTER if tick >= 500 else None)
+        verdict = deadman.step(tick * 20_000_000, fits.poll(tick * 20_000_000, view), State.READY)
+        armed += [tick] if verdict.requests else []
+    assert armed[0] >= 500
 
 
 def test_a_script_that_does_not_fit_ends_before_anything_moves():

@@ -56,6 +56,8 @@ def test_sticks_become_wheel_speeds():
     assert (forward.left_rad_s, forward.right_rad_s, forward.deadman) == (8.0, 8.0, True)
     left = bench.poll(GamepadState(0, 0.0, 1.0, True))
     assert (left.left_rad_s, left.right_rad_s) == (-4.0, 4.0)
+    back_left = bench.poll(GamepadState(0, -1.0, 1.0, True))
+    assert (back_left.left_rad_s, back_left.right_rad_s) == (-8.0, -8 / 3)
 
 
 def test_what_is_held_still_stays_new_until_the_silence_is_too_long():

@@ -100,6 +100,38 @@ def test_pasted_text_holds_nothing(terminal):
     assert not terminal.poll(2000).deadman
 
 
+@pytest.mark.parametrize("lines", [2, 3, 5])
+def test_a_mouse_wheel_that_sends_arrows_holds_nothing(terminal, lines):
+    for _ in range(20):
+        terminal.type(b"\x1bOA" * lines)
+        assert not terminal.last.deadman
+        assert not terminal.poll(60).deadman
+
+
+def test_what_a_stalled_connection_delivers_late_holds_nothing(terminal):
+    terminal.hold()
+    assert not terminal.poll(3000).deadman
+    for waited in (1, 2, 4, 8, 16):
+        terminal.type(b"w" * waited)
+        assert not terminal.last.deadman
+    assert not terminal.type(b"w").deadman
+
+
+def test_two_repeats_that_a_busy_host_reads_at_once_drive_on(terminal):
+    terminal.hold()
+    for keys in (b"ww", b"w", b"ww"):
+        assert terminal.type(keys).deadman
+
+
+def test_each_read_since_the_last_poll_counts_by_itself(terminal):
+    terminal.hold()
+    assert terminal.last.deadman
+    for keys, total in ((b"w", 1), (b"www", 4), (b"w", 5)):
+        os.write(terminal.master, keys)
+        terminal.arrived(total)
+    assert not terminal.poll().deadman
+
+
 def test_another_key_among_repeats_stops(terminal):
     terminal.hold()
     assert not terminal.type(b"w?w").deadman
@@ -112,6 +144,13 @@ def test_ctrl_d_ends(terminal):
     assert terminal.keyboard.completed
     os.write(terminal.master, b"w")
     assert not terminal.poll(100).deadman
+
+
+def test_ctrl_z_stops_the_robot_and_not_the_daemon(terminal):
+    assert termios.tcgetattr(terminal.slave)[6][termios.VSUSP] == b"\0"
+    terminal.hold()
+    assert not terminal.type(b"\x1a").deadman
+    assert terminal.keyboard.ended is None
 
 
 def test_keys_count_from_when_they_came_not_from_when_they_are_polled(terminal):

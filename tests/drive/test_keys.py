@@ -168,4 +168,10 @@ def test_wheel_speeds_keep_the_limit_and_the_sense_of_turning(forward, turn, top
 
 def test_pushing_left_turns_left():
     assert wheel_speeds(0.0, 1.0, 8.0) == (-8.0, 8.0)
+
+
+@pytest.mark.parametrize(("key", "left", "right"), [(b"q", 1, 3), (b"e", 3, 1), (b"z", -3, -1), (b"c", -1, -3)])
+def test_the_keys_on_the_left_turn_left_and_those_on_the_right_turn_right(typist, key, left, right):
+    newest = typist.hold(key, 600)[-1]
+    assert (newest.left_rad_s, newest.right_rad_s) == (2 * left, 2 * right)
     assert wheel_speeds(1.0, 0.5, 9.0) == (3.0, 9.0)

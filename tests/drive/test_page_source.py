@@ -41,7 +41,13 @@ def test_a_hold_is_as_old_as_the_stamp_that_the_page_had_seen():
 
 
 @pytest.mark.parametrize(
-    ("forward", "left", "wheels"), [(-0.5, 0.0, (-4.0, -4.0)), (0.0, 1.0, (-4.0, 4.0)), (1.0, 1.0, (8 / 3, 8.0))]
+    ("forward", "left", "wheels"),
+    [
+        (-0.5, 0.0, (-4.0, -4.0)),
+        (0.0, 1.0, (-4.0, 4.0)),
+        (1.0, 1.0, (8 / 3, 8.0)),
+        (-1.0, 1.0, (-8.0, -8 / 3)),
+    ],
 )
 def test_shares_become_wheel_speeds_within_the_limit(forward, left, wheels):
     source = pressed()

@@ -11,11 +11,22 @@ import msgspec
 import pytest
 
 from disco_hw.errors import InputError, WorkError
+from disco_hw.first_use import procedure
 from disco_hw.first_use.commission import STAGES, CommissionOptions, as_sent, run_commission, write_fields
-from disco_hw.first_use.procedure import MOST_SHARE, CommissionPilot, FloorSeen, Procedure, Track
+from disco_hw.first_use.procedure import (
+    MOST_SHARE,
+    CommissionPilot,
+    FloorSeen,
+    Procedure,
+    Prompt,
+    Reset,
+    Silence,
+    Track,
+)
 from disco_hw.log.records import Event
 from disco_hw.runtime.assembly import pose_source_of
 from disco_hw.runtime.robot_setup import load_setup
+from disco_hw.runtime.supervisor import UserRequest
 from drivers.types import PoseSample, WheelSample
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
@@ -295,6 +306,74 @@ def test_a_robot_on_blocks_is_driven_to_the_end_though_its_poses_stand_still(pat
     assert_driven_to_the_end(run)
 
 
+def after(seconds, wanted):
+    """Whether what is wanted of a pilot has been so for this long, by the times it is asked with."""
+    since = []
+
+    def holds(pilot, now_ns):
+        if wanted(pilot):
+            since.append(now_ns)
+        return bool(since) and now_ns - since[0] > 1e9 * seconds
+
+    return holds
+
+
+def silent(pilot):
+    return isinstance(pilot.procedure.action, Silence)
+
+
+def watchdog(robot, slowest_rad_s):
+    """The end of the stage `turns`."""
+    return procedure._watchdog((procedure.speed_of(robot, slowest_rad_s),) * 2)
+
+
+def question(_robot, _slowest_rad_s):
+    """A question that the simulated operator does not answer."""
+    yield Prompt("was that right? y yes", "y")
+
+
+# What is driven with which controller, and when somebody presses the e-stop.
+PRESSED = {
+    "before it is ready": (procedure.sides, "reference", lambda _pilot, now_ns: now_ns > 0),
+    "driving": (procedure.sides, "odrive", after(1.0, lambda pilot: pilot._driving)),
+    "asked": (question, "odrive", after(0.5, lambda pilot: isinstance(pilot.procedure.action, Prompt))),
+    "driving a turn": (procedure.turns, "agilex", after(0.5, lambda pilot: pilot._driving)),
+    "driving on the floor": (procedure.floor, "vesc", after(1.5, lambda pilot: pilot._driving)),
+    "silent": (watchdog, "odrive", after(1.0, silent)),
+    "a fault is cleared": (watchdog, "odrive", lambda pilot, _now_ns: isinstance(pilot.procedure.action, Reset)),
+}
+
+
+@pytest.mark.parametrize("when", PRESSED)
+def test_an_e_stop_ends_a_stage_and_stays(tmp_path, monkeypatch, when):
+    steps, driver, is_pressed = PRESSED[when]
+    if when == "silent":
+        monkeypatch.setattr(odrive.Axis, "check_watchdog", lambda *_args: None)
+    pressed, resets, outputs = [], [], []
+
+    class Pilot(CommissionPilot):
+        def step(self, now_ns, last):
+            desired = super().step(now_ns, last)
+            if pressed:
+                resets.extend(r for r in desired.requests if r is UserRequest.RESET)
+            elif is_pressed(self, now_ns):
+                pressed.append(now_ns)
+                desired = replace(desired, requests=(*desired.requests, UserRequest.ESTOP))
+            return desired
+
+        def learn(self, now_ns, tick, replies):
+            super().learn(now_ns, tick, replies)
+            outputs.append(tick.output)
+
+    monkeypatch.setattr("tests.first_use.miswired.CommissionPilot", Pilot)
+    with pytest.raises(WorkError, match=r"e-stop requested by the operator; correct it, then reset"):
+        stage(robot_file(tmp_path, driver), steps, Miswiring(pose=lifted), step_us=COARSE_US)
+    assert not resets
+    # The daemon ends with it, so it must have arrived.
+    assert outputs[-1].estop
+    assert not outputs[-1].send_estop
+
+
 def test_a_watchdog_that_is_off_is_named(tmp_path, monkeypatch):
     path = robot_file(tmp_path, "odrive")
     monkeypatch.setattr(odrive.Axis, "check_watchdog", lambda *_args: None)
@@ -351,8 +430,8 @@ def test_who_holds_a_key_that_does_not_count_is_told_once(path):
 
     ineffective = [False, True, True, False, True]
     readings = iter(ineffective)
-    procedure = Procedure(STAGES[0].steps(load_setup(path).config.robot, 0.0))
-    pilot = CommissionPilot(procedure, Idle(), str, lambda: next(readings))
+    steps = Procedure(STAGES[0].steps(load_setup(path).config.robot, 0.0))
+    pilot = CommissionPilot(steps, Idle(), str, lambda: next(readings))
     messages = [
         [text for text in pilot.step(k, None).events if "release all keys" in text] for k in range(len(ineffective))
     ]
