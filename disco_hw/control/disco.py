@@ -231,7 +231,7 @@ class Disco:
         """Whether the guide has the robot, whatever the plan costs."""
         if not self.optimiser.guide_is_valid or self._sampling.guide_touches:
             return False
-        return self._guidance.has_robot(now_ns, system, trajectory)
+        return self._guidance.has_robot(now_ns, system, self.chassis, trajectory)
 
     def _set_refined_model(self) -> None:
         """Refine in the mean of the belief in force."""

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from disco_hw.control.backwards import guide_backwards, task_of
-from disco_hw.control.kernel import Floats
+from disco_hw.control.kernel import START_LEFT, START_RIGHT, Floats
 from disco_hw.control.kernel.avoid import TOUCH_COST
 from disco_hw.control.kernel.guide import SteeredChassis, guide
 from disco_hw.control.kernel.skid_steer import SkidSteer
@@ -133,7 +133,7 @@ class Guidance:
             self._guide(commands, terms, *arguments)
         return True
 
-    def has_robot(self, now_ns: int, system: SkidSteer, trajectory: Array) -> bool:
+    def has_robot(self, now_ns: int, system: SkidSteer, chassis: SteeredChassis, trajectory: Array) -> bool:
         """Whether the guide has the robot: for a horizon from a plan on that stands, as across the line or far off it.
 
         Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan.
@@ -144,7 +144,10 @@ class Guidance:
         way_m = task_of(system.task).way_ahead_m(half * settings.step_s)
         # From the last place on: that of a plan which does not stand is far enough.
         begin, *places = trajectory[: half + 1, :2].tolist()
-        if all(math.dist(begin, place) < NEAR_ZERO_SPEED * way_m for place in reversed(places)):
+        # A robot that is on its way brakes by such a plan, as before a corner, and does not stand.
+        rolls_m_s = 0.5 * chassis.wheel_radius_m * abs(float(system.start[START_LEFT] + system.start[START_RIGHT]))
+        is_slow = rolls_m_s * half * settings.step_s < NEAR_ZERO_SPEED * way_m
+        if is_slow and all(math.dist(begin, place) < NEAR_ZERO_SPEED * way_m for place in reversed(places)):
             self.until_ns = now_ns + round(horizon_s * 1e9)
         return self.until_ns is not None and now_ns < self.until_ns
 

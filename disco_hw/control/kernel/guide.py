@@ -78,6 +78,7 @@ def guide(
     wheel_left, wheel_right = float(start[START_LEFT]), float(start[START_RIGHT])
     place = float(start[START_MEMORY])
     half_axle, x_icr_m, lead_s = 0.5 * chassis.axial_distance_m, chassis.x_icr_m, chassis.response_s
+    turn_rad_s2 = limits.change * chassis.wheel_radius_m / (half_axle * step_s)
     keep = math.exp(-step_s / lead_s) if lead_s > 0.0 else 0.0
     settled = (1.0 - keep) * lead_s / step_s
     for t in range(commands.shape[0]):
@@ -91,7 +92,12 @@ def guide(
         _, _, from_x, from_y, along, _ = line_at(terms, place, speed * lead_s)
         _, _, to_x, to_y, _, _ = line_at(terms, place, speed * lead_s + TURN_M)
         bend = math.atan2(from_x * to_y - from_y * to_x, from_x * to_x + from_y * to_y) / TURN_M
-        turn = speed * (bend - YAW_PER_M * math.atan2(math.sin(off_rad), math.cos(off_rad)))
+        off_rad = math.atan2(math.sin(off_rad), math.cos(off_rad))
+        turn = speed * (bend - YAW_PER_M * off_rad)
+        # No faster than the turn can end by the time the robot faces right: it would turn past, to and fro.
+        fastest = math.sqrt(2.0 * turn_rad_s2 * abs(off_rad))
+        if speed * YAW_PER_M * abs(off_rad) > fastest:
+            turn = -math.copysign(fastest, off_rad)
         # On a line that can be followed, along^2 + (x_icr * bend)^2 = 1.
         along = max(along, LEAST_FORWARD * (1.0 - min(abs(x_icr_m * bend), 1.0)))
         forward = speed * (along + (1.0 - along) * returning) * max(math.cos(off_rad), SLOWEST)

@@ -127,8 +127,16 @@ class PathTerms(NamedTuple):
         row = 4 * _row(place, self.first, self.last)
         piece = (self.table[row], self.table[row + 1], self.table[row + 2], self.table[row + 3])
         off_x, off_y, along_x, along_y = _offset(self.last, place, x, y, piece)
-        along = min(max(off_x * along_x + off_y * along_y, -FARTHEST_STEP_M), FARTHEST_STEP_M) * self.per_m
-        return min(self.last, max(self.first, place + along))
+        along = min(max(off_x * along_x + off_y * along_y, -FARTHEST_STEP_M), FARTHEST_STEP_M)
+        moved = min(self.last, max(self.first, place + along * self.per_m))
+        if along < _ZERO:
+            row = 4 * _row(moved, self.first, self.last)
+            piece = (self.table[row], self.table[row + 1], self.table[row + 2], self.table[row + 3])
+            off_x, off_y, along_x, along_y = _offset(self.last, moved, x, y, piece)
+            if off_x * along_x + off_y * along_y > -along:
+                # Beyond a corner: from the way before it the place would come back by more, and so on for ever.
+                return place
+        return moved
 
     def line_at(self, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
         """Return x, y, cosine and sine of the heading, cosine of heading against path, and speed, `ahead_m` further on.

@@ -50,6 +50,32 @@ def test_the_guide_turns_before_a_corner_and_keeps_to_it():
     assert before[2] > 0.6
 
 
+FAST_M_S, FAST_LIMITS = 0.9, CommandLimits(7.0, 10.0)
+SHARP = PathCost(PathTable(np.array([[0.0, 0.0], [4.0, 0.0], [3.2, 1.8]])), FAST_M_S)
+
+
+@pytest.fixture(scope="module")
+def large_model(tmp_path_factory):
+    """A robot whose wheels take longer to turn it round than it takes to get to a corner."""
+    file = tmp_path_factory.mktemp("large") / "model.toml"
+    file.write_text(
+        'format = 1\nname = "large"\n\n[base]\nwheel_radius_m = 0.165\naxial_distance_m = 1.0\nx_icr_m = 0.0\n'
+    )
+    return load_model(file)
+
+
+@pytest.mark.parametrize("state", [(4.2, 0.0, 0.0), (4.5, 0.1, 0.4), (5.5, -0.1, 0.5), (5.5, 0.1, -0.5)])
+def test_the_guide_comes_back_from_beyond_a_corner(large_model, state):
+    settings = replace(SETTINGS, sampler=replace(SETTINGS.sampler, horizon=80))
+    planner = Disco(large_model, SHARP, settings, FAST_LIMITS)
+    planner.plan(0, PlannerState(0, *state, 5.0, 5.0))
+    commands = planner.optimiser.work.guide.astype(float)
+    states = FreeRun(large_model, large_model.point()[None], STEP_S).states(np.array([*state, 5.0, 5.0]), commands, 0)
+    second = np.array([-0.8, 1.8]) / math.hypot(0.8, 1.8)
+    off_m = (states[:, 0] - 4.0) * second[1] - states[:, 1] * second[0]
+    assert abs(off_m[-1]) < 0.1
+
+
 @pytest.mark.parametrize("yaw_rad", [-2.0, 0.5, 1.9, 3.1])
 @pytest.mark.parametrize("y_m", [-0.4, 0.3])
 def test_the_guide_reaches_a_line_from_beside_it_whichever_way_it_faces(y_m, yaw_rad):
@@ -98,9 +124,9 @@ def test_a_plan_that_stands_gives_way_to_the_guide_for_a_horizon():
     planner = Disco(MODEL, STRAIGHT, still, LIMITS)
     straight_on = np.full((SETTINGS.sampler.horizon, 2), SPEED_M_S / 0.061)
 
-    def planned(now_s):
+    def planned(now_s, wheels_rad_s=0.5):
         now_ns = round(now_s * 1e9)
-        return planner.plan(now_ns, PlannerState(now_ns, 1.0, 0.0, 1.57, 3.0, 3.0)).wheel_speeds
+        return planner.plan(now_ns, PlannerState(now_ns, 1.0, 0.0, 1.57, wheels_rad_s, wheels_rad_s)).wheel_speeds
 
     def planned_from_straight_on(now_s):
         planned(now_s)
@@ -108,6 +134,8 @@ def test_a_plan_that_stands_gives_way_to_the_guide_for_a_horizon():
         # Made anew at the same time, a plan stays as it is.
         return planned(now_s)
 
+    # A robot that is on its way brakes by such a plan.
+    assert not np.array_equal(planned(0.0, wheels_rad_s=3.0), planner.optimiser.work.guide)
     np.testing.assert_array_equal(planned(0.0), planner.optimiser.work.guide)
     np.testing.assert_array_equal(planned_from_straight_on(3.9), planner.optimiser.work.guide)
     np.testing.assert_allclose(planned_from_straight_on(4.1), straight_on, atol=0.01)
