@@ -209,7 +209,8 @@ class Effect:
     How it is reported: `sentence` for a report, with `{parameter}` fields, of a time `{parameter_s}` in s or
     `{parameter_ms}` in ms; `sentence_below` in its place where the first parameter is below zero, with its size;
     `other_symptoms`, pairs of a parameter and what follows the sentence where that one is known, too; `excitation`, the
-    manoeuvre that shows it, and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
+    manoeuvre that shows it, and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`; `pose_key`,
+    the key of [pose] in robot.toml that corrects it, and the sign with which its parameters are added there.
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `delayed_by`, the parameter that is the delay of the wheels behind commands,
@@ -239,6 +240,7 @@ class Effect:
     sentence_below: str | None = None
     other_symptoms: tuple[tuple[str, str], ...] = ()
     symptoms: tuple[Symptom, ...] = ()
+    pose_key: tuple[str, float] | None = None
     uses_geometry: bool = False
     may_turn_more: bool = False
     delayed_by: str | None = None
@@ -296,6 +298,13 @@ class Effect:
         times = {name: value for name, value in values.items() if name.endswith("_s")}
         in_ms = {f"{name.removesuffix('_s')}_ms": 1e3 * value for name, value in times.items()}
         return text.format(**in_ms, **values)
+
+    def pose_correction(self, values: Mapping[str, float]) -> tuple[str, tuple[float, ...]] | None:
+        """Return the key of [pose] that corrects the effect, and what is to be added to it; None without such a key."""
+        if self.pose_key is None:
+            return None
+        key, sign = self.pose_key
+        return key, tuple(sign * values[parameter.name] for parameter in self.parameters if parameter.name in values)
 
     @property
     def moves(self) -> bool:

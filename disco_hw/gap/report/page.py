@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 from disco_hw import reports
+from disco_hw.effects import Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
 from disco_hw.gap.report.events import RareEvent
@@ -52,6 +53,10 @@ def summary_lines(report: GapReport) -> list[str]:
         lines.append("Nothing is missing that this log could show.")
     if effects:
         lines.append(f"How sure: with 95 % probability {'; '.join(_range(each) for each in effects)}.")
+    corrections = [text for each in report.effects if (text := _pose_correction(each)) is not None]
+    if corrections:
+        where = "Correct the pose sensor in [pose] of robot.toml, as no model does (a missing key is 0)"
+        lines.append(f"{where}: {'; '.join(corrections)}.")
     if report.events:
         told = sorted(report.events, key=lambda event: -event.share)[:most]
         text = "; ".join(event.describe() for event in sorted(told, key=report.events.index))
@@ -69,6 +74,20 @@ def summary_lines(report: GapReport) -> list[str]:
     if report.provenance is not None:
         lines.append(f"Go on: `{report.provenance.go_on}`.")
     return lines
+
+
+def _pose_correction(effect: EffectFinding) -> str | None:
+    """Describe what is to be added to which key of [pose] for an effect of the pose sensor; None for any other."""
+    described = REGISTRY[effect.name]
+    correction = described.pose_correction({name: estimate.value for name, estimate in effect.parameters.items()})
+    if correction is None:
+        return None
+    key, added = correction
+    value = ", ".join(f"{each:+.4f}" for each in added)
+    text = f"add {f'[{value}]' if len(added) > 1 else value} {described.parameters[0].unit} to {key}"
+    if described.stage is Stage.POSE_TIME and added[0] < 0.0:
+        text += ", and where that falls below 0 correct the stamps at their source"
+    return text
 
 
 def _range(effect: EffectFinding) -> str:

@@ -208,6 +208,21 @@ def test_an_answer_of_many_names_is_short():
     assert few[5].startswith(next_drive)
 
 
+def test_what_the_pose_sensor_does_is_corrected_in_robot_toml():
+    bias, early = effect("heading_bias", 0.002, bias_rad=0.0499), effect("pose_latency", 0.01, latency_s=-0.065)
+    beside = effect("pose_offset", 0.01, forward_m=0.02, left_m=-0.03)
+    lines = summary_lines(replace(report(0.014), effects=(bias, early, beside)))
+    assert lines[4] == (
+        "Correct the pose sensor in [pose] of robot.toml, as no model does (a missing key is 0): add -0.0499 rad to "
+        "yaw_offset_rad; add -0.0650 s to latency_s, and where that falls below 0 correct the stamps at their source; "
+        "add [+0.0200, -0.0300] m to offset."
+    )
+    late = summary_lines(replace(report(0.014), effects=(effect("pose_latency", 0.01, latency_s=0.0897),)))
+    assert late[2].endswith(": add +0.0897 s to latency_s.")
+    other = replace(report(0.014), effects=(effect("motor_lag", tau_s=0.1),))
+    assert "robot.toml" not in " ".join(summary_lines(other))
+
+
 def test_what_logs_share_is_told_apart_from_what_differs():
     shared = AcrossLogs("wheel_radius_m", ((0.06, 0.059, 0.061), (0.0601, 0.059, 0.061)), False)
     other = AcrossLogs("axial_distance_m", ((0.4, 0.39, 0.41), (0.5, 0.49, 0.51)), True)
