@@ -26,9 +26,17 @@ def test_the_share_of_the_gap_to_the_noise_that_is_closed_is_of_position_and_of_
     remains = Remains.of(TIMED, errors(0.02, 0.10), FLOOR, None)
     assert remains.closed == pytest.approx((0.75, 0.0))
     assert remains.as_dict()["closed_position"] == pytest.approx(0.75)
-    # Where `timed` errs by the noise there is no gap, and a model that errs by more has closed less than none.
+    # Where `timed` errs by the noise there is no gap, and a model that errs by more has closed none.
     assert Remains.of(FLOOR, FLOOR, FLOOR, None).closed == (None, None)
-    assert Remains.of(TIMED, errors(0.07, 0.06), FLOOR, None).closed == pytest.approx((-0.5, 0.5))
+    assert Remains.of(TIMED, errors(0.07, 0.06), FLOOR, None).closed == pytest.approx((0.0, 0.5))
+
+
+def test_no_share_is_told_of_a_gap_as_small_as_what_the_noise_is_known_by_nor_more_than_all_of_it():
+    # A robot of which all was found: in position there was next to nothing to explain.
+    found = Remains.of(errors(0.00469, 0.013), errors(0.00446, 0.0040), errors(0.00464, 0.0041), None)
+    assert found.closed == (None, 1.0)
+    assert found.describe() == "Of what is more than the sensors' noise this explains 100% in heading."
+    assert found.as_dict()["closed_position"] is None
 
 
 @pytest.mark.parametrize(
