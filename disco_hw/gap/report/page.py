@@ -48,7 +48,8 @@ def summary_lines(report: GapReport) -> list[str]:
     if not effects and report.unnamed:
         lines.append(f"Something is missing that has no name: {_describe(report.unnamed[0])}.")
     elif not effects and (report.residue or report.doubtful):
-        lines.append("Something is missing that none of the known effects explains.")
+        if report.remains is None or not report.remains.is_explained:
+            lines.append("Something is missing that none of the known effects explains.")
     elif not effects:
         lines.append("Nothing is missing that this log could show.")
     if effects:

@@ -39,6 +39,17 @@ def test_no_share_is_told_of_a_gap_as_small_as_what_the_noise_is_known_by_nor_mo
     assert found.as_dict()["closed_position"] is None
 
 
+def test_that_something_is_missing_is_not_said_of_a_robot_predicted_to_the_noise():
+    residue = ("command_to_wheel: speeding up still disagrees: 5.5 times the noise",)
+    bare = replace(report_of("motor_lag", 0.05, 0.02), effects=(), unnamed=(), doubtful=(), residue=residue)
+    missing = "Something is missing that none of the known effects explains."
+    said = summary_lines(replace(bare, remains=Remains.of(FLOOR, FLOOR, FLOOR, None)))
+    assert missing not in said
+    assert "What is left is the sensors' noise." in said
+    assert missing in summary_lines(replace(bare, remains=Remains.of(TIMED, TIMED, FLOOR, None)))
+    assert missing in summary_lines(bare)
+
+
 @pytest.mark.parametrize(
     ("position_m", "yaw_rad", "explained"), [(0.02, 0.04, True), (0.021, 0.02, False), (0.01, 0.041, False)]
 )
