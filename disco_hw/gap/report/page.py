@@ -26,9 +26,9 @@ def other_known_symptoms(effect: EffectFinding, settings: ReportSettings = DEFAU
 
 
 def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> str:
-    """Describe what a missing effect does, with its values."""
+    """Describe what a missing effect does, with its values, or the nearest ones that are possible."""
     described = REGISTRY[effect.name]
-    values = {name: estimate.value for name, estimate in effect.parameters.items()}
+    values = described.possible({name: estimate.value for name, estimate in effect.parameters.items()})
     others = dict(described.other_symptoms)
     also = (described.fill(others[name], values) for name in other_known_symptoms(effect, settings))
     return "; ".join((described.describe(values), *also))

@@ -61,7 +61,7 @@ class Remains:
 
     @property
     def closed(self) -> tuple[float | None, float | None]:
-        """Share, 0 to 1, of the gap from `timed` to noise that is closed: position, heading; None where there is none."""
+        """Share of the gap between `timed` and noise that is closed, 0 to 1: position, heading; None for no gap."""
         ends = zip(self.before, self.after, self.floor, strict=True)
         position, heading = (
             min(max((b - a) / (b - f), 0.0), 1.0) if b > (1.0 + _LEAST_GAP) * f else None for b, a, f in ends

@@ -146,6 +146,23 @@ def test_that_wheels_are_unequal_is_said_where_only_their_load_shows_it_and_it_i
     assert ("the right wheels are -0.95% larger than the mean" in line) is said
 
 
+@pytest.mark.parametrize(
+    ("stop_share", "wide", "said"),
+    [
+        (-0.003, 0.01, "; a wheel stops at once"),
+        (0.03, 0.01, "; a wheel stops at once"),
+        (0.5, 0.1, "; a stop takes 0.50 of that time"),
+        # What is hardly known is not told.
+        (-0.003, 2.94, ""),
+    ],
+)
+def test_a_value_outside_what_is_possible_is_told_as_the_nearest_that_is(stop_share, wide, said):
+    limit = effect("acceleration_limit", wide, limit_rad_s2=0.342, stop_share=stop_share)
+    assert sentence(limit) == f"each wheel's speed changes by no more than 0.34 rad/s^2{said}"
+    below = effect("acceleration_limit", wide, limit_rad_s2=0.01, stop_share=stop_share)
+    assert sentence(below).startswith("each wheel's speed changes by no more than 0.05 rad/s^2")
+
+
 @pytest.mark.parametrize(("delay_s", "wrong"), [(0.12, False), (-0.17, True)])
 def test_a_response_before_its_command_is_said_to_be_a_wrong_clock(delay_s, wrong):
     assert ("clock" in sentence(effect("command_delay", delay_s=delay_s))) == wrong
