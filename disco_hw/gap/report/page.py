@@ -41,17 +41,7 @@ def summary_lines(report: GapReport) -> list[str]:
     """
     most = report.settings.report.most_listed
     effects = report.effects[:most]
-    lines = [f"{text[0].upper()}{text[1:]}." for text in (sentence(each, report.settings.report) for each in effects)]
-    more = len(report.effects) - len(effects)
-    if more:
-        lines[-1] += f" And {more} more, listed below."
-    if not effects and report.unnamed:
-        lines.append(f"Something is missing that has no name: {_describe(report.unnamed[0])}.")
-    elif not effects and (report.residue or report.doubtful):
-        if report.remains is None or not report.remains.is_explained:
-            lines.append("Something is missing that none of the known effects explains.")
-    elif not effects:
-        lines.append("Nothing is missing that this log could show.")
+    lines = _missing(report, effects)
     if effects:
         lines.append(f"How sure: with 95 % probability {'; '.join(_range(each) for each in effects)}.")
     corrections = [text for each in report.effects if (text := _pose_correction(each)) is not None]
@@ -74,6 +64,26 @@ def summary_lines(report: GapReport) -> list[str]:
         lines.append(f"{advice} log could not have shown {names} of realistic size.")
     if report.provenance is not None:
         lines.append(f"Go on: `{report.provenance.go_on}`.")
+    return lines
+
+
+def _missing(report: GapReport, effects: Sequence[EffectFinding]) -> list[str]:
+    """Describe what is missing: these effects with a mark on those that the model leaves out, or else what there is."""
+    written = {setting.name for setting in report.model.effects}
+    lines = []
+    for each in effects:
+        text = sentence(each, report.settings.report)
+        lines.append(f"{text[0].upper()}{text[1:]}{'' if each.name in written else ' (not in model.toml)'}.")
+    more = len(report.effects) - len(effects)
+    if more:
+        lines[-1] += f" And {more} more, listed below."
+    if not effects and report.unnamed:
+        lines.append(f"Something is missing that has no name: {_describe(report.unnamed[0])}.")
+    elif not effects and (report.residue or report.doubtful):
+        if report.remains is None or not report.remains.is_explained:
+            lines.append("Something is missing that none of the known effects explains.")
+    elif not effects:
+        lines.append("Nothing is missing that this log could show.")
     return lines
 
 
@@ -118,7 +128,7 @@ def _gap_line(report: GapReport) -> str:
     last = f"the sensors' noise makes {off['floor']}" if "floor" in off else f"the model as given by {off['nominal']}"
     line = (
         f"{horizon} ahead, in parts of the log that were not used, {'predictions' if report.gap else 'the wheels'} "
-        f"are off by {off['timed']} with a delay and a lag alone (timed), by {off['amended']} with what was found "
+        f"are off by {off['timed']} with a delay and a lag alone (timed), by {off['amended']} with {_added(report)} "
         f"(amended); {last}."
     )
     if "written" in off:
@@ -126,7 +136,26 @@ def _gap_line(report: GapReport) -> str:
     if report.why_not_amended is None:
         return line
     offered = report.offered if report.gap or report.offered == "timed" else "given"
-    return f"{line} Drive with the {offered} model, which is in model.toml. {report.why_not_amended}"
+    names = _names_in_model(report)
+    return (
+        f"{line} Drive with the {offered} model, which is in model.toml{f', with {names}' if names else ''}. "
+        f"{report.why_not_amended}"
+    )
+
+
+def _names_in_model(report: GapReport) -> str:
+    """List the effects of the model that is handed out, with those marked that are doubtful; empty without any."""
+    doubtful = {one.name for one in report.doubtful}
+    names = (setting.name for setting in report.model.effects)
+    return ", ".join(f"{name} (doubtful)" if name in doubtful else name for name in names)
+
+
+def _added(report: GapReport) -> str:
+    """Describe what the amended model has, of which only the one that is handed out is known by its effects."""
+    if report.why_not_amended is not None:
+        return "more effects"
+    names = _names_in_model(report) or "no effect"
+    return f"{names} and what no model can hold" if "written" in (report.gap or report.wheels) else names
 
 
 def as_text(report: GapReport) -> str:
@@ -195,7 +224,7 @@ _DEFINITIONS = {
     "nominal": "the model as given",
     "refitted": "its wheel radius, axial distance and centre of turning fitted, from commands to poses",
     "timed": "a command delay and a motor lag too: what a careful engineer fits by hand",
-    "amended": "with everything that was found",
+    "amended": "with what was found, as far as predictions need it",
     "floor": "what the noise of the sensors makes of a perfect model",
     "held out": "predicted by what was fitted on other stretches of the log",
     "evidence": "twice the gain in log likelihood, less the price of the parameters",

@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import pytest
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import offered_stage
-from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
+from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, LowConfidence, Provenance, UnnamedFinding
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.page import as_text, page, sentence, summary_lines
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from disco_hw.model import Model
+from disco_hw.model import EffectSetting, Model
 from disco_hw.model.terms import TERMS
 from disco_hw.reports import as_json
 
@@ -47,7 +48,7 @@ def report(amended_m, yaw_rad=0.02, blind=(), offered="amended"):
 def test_the_answer_has_the_gap_before_and_after_and_the_noise():
     assert summary_lines(report(0.014))[1] == (
         "2 s ahead, in parts of the log that were not used, predictions are off by 47 mm and 0.02 rad with a delay "
-        "and a lag alone (timed), by 14 mm and 0.02 rad with what was found (amended); the sensors' noise makes 14 mm "
+        "and a lag alone (timed), by 14 mm and 0.02 rad with no effect (amended); the sensors' noise makes 14 mm "
         "and 0.02 rad."
     )
 
@@ -102,6 +103,30 @@ def test_a_model_that_lacks_what_no_model_can_carry_is_judged_without_it(written
     assert of.as_dict()["gap"]["written"]["position_rmse_m"] == written_m
     assert "written" not in report(0.014).as_dict()["gap"]
     assert said in page(of)
+
+
+def model_with(*names):
+    """A model with these effects."""
+    effects = (EffectSetting(name, {p.name: p.start for p in REGISTRY[name].parameters}) for name in names)
+    return Model(0.06, 0.4, effects=tuple(effects))
+
+
+def test_the_answer_credits_the_effects_of_the_model_that_is_written_and_marks_those_that_it_leaves_out():
+    found = replace(
+        report(0.014),
+        effects=(effect("motor_lag", tau_s=0.1), effect("turn_slip", k_s=0.12)),
+        doubtful=(LowConfidence("command_delay", "hardly known"),),
+        model=model_with("command_delay", "motor_lag"),
+    )
+    lines = summary_lines(found)
+    assert lines[0].endswith("with a time constant of 100 ms.")
+    assert lines[1].endswith(" (not in model.toml).")
+    assert "rad with command_delay (doubtful), motor_lag (amended);" in lines[3]
+    timed = summary_lines(replace(found, gap=report(0.052).gap, offered="timed"))[3]
+    assert "rad with more effects (amended);" in timed
+    assert "in model.toml, with command_delay (doubtful), motor_lag. The amended model has more effects" in timed
+    without = replace(without_its_terms(0.02), model=found.model, doubtful=found.doubtful)
+    assert "with command_delay (doubtful), motor_lag and what no model can hold (amended);" in summary_lines(without)[1]
 
 
 def test_one_drive_is_asked_for():

@@ -111,7 +111,7 @@ def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines
     assert len(lines) <= 10
     early = EffectFinding("pose_latency", "pose_sensor", {"latency_s": ParameterEstimate(-0.065, -0.07, -0.06)}, 9.0)
     assert summary_lines(replace(found, effects=(early,)))[:2] == [
-        "Poses are stamped 65 ms early.",
+        "Poses are stamped 65 ms early (not in model.toml).",
         "How sure: with 95 % probability pose_latency is between 0.06 and 0.07 s.",
     ]
 
