@@ -162,8 +162,14 @@ def as_text(report: GapReport) -> str:
     """Format the report as text for a terminal."""
     lines = [*(f"warning: {warning}" for warning in report.warnings), *summary_lines(report), ""]
     for effect in report.effects:
-        values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-        lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
+        written = _values_in_model(report, effect)
+        values = ", ".join(
+            f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]{f', {written[n]} in model.toml' if n in written else ''}"
+            for n, e in effect.parameters.items()
+        )
+        out = "" if written else ", not in model.toml"
+        lines.append(f"{effect.channel}: {effect.name}: {values}{out}{_confounded(effect)}")
+    lines += _why_values_differ(report)
     lines += [f"{term.channel}: unnamed: {_describe(term)}{_confounded(term)}" for term in report.unnamed]
     lines += [f"doubtful: {one.name}: {one.why}" for one in report.doubtful]
     lines += [f"event: {_describe_event(event)}" for event in report.events]
@@ -176,6 +182,30 @@ def as_text(report: GapReport) -> str:
             cells = (_in_cell(of[stage][horizon]) for stage in of)
             lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
     return "\n".join(lines)
+
+
+def _values_in_model(report: GapReport, effect: EffectFinding) -> dict[str, str]:
+    """Return the parameters that model.toml has of an effect, formatted; empty if it lacks the effect."""
+    settings = (setting for setting in report.model.effects if setting.name == effect.name)
+    return {name: f"{value:.4g}" for setting in settings for name, value in setting.values.items()}
+
+
+def _why_values_differ(report: GapReport) -> list[str]:
+    """Return a sentence on why model.toml has other values than were found; none where it has the same.
+
+    Without poses there are no predictions of the whole chain, and nothing is fitted to them.
+    """
+    pairs = (
+        (f"{found.value:.4g}", _values_in_model(report, effect).get(name))
+        for effect in report.effects
+        for name, found in effect.parameters.items()
+    )
+    if not report.gap or all(written is None or written == found for found, written in pairs):
+        return []
+    return [
+        "model.toml's values are fitted to whole predictions, from commands to poses, and may lie outside the "
+        "intervals, which are of one channel at a time"
+    ]
 
 
 def _describe_logs(report: GapReport) -> list[str]:
@@ -320,18 +350,22 @@ def _effects(report: GapReport) -> str:
     rows = []
     for effect in report.effects:
         values = ", ".join(f"{n} = {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-        also = ", ".join(effect.indistinguishable_from)
-        rows.append((effect.name, effect.channel, values, f"{effect.evidence:.0f}", also, effect.experiment or ""))
+        of_model = ", ".join(f"{n} = {value}" for n, value in _values_in_model(report, effect).items()) or "not in it"
+        also, test = ", ".join(effect.indistinguishable_from), effect.experiment or ""
+        rows.append((effect.name, effect.channel, values, of_model, f"{effect.evidence:.0f}", also, test))
     for term in report.unnamed:
         place = (
             "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
         )
         also, test = ", ".join(term.indistinguishable_from), f"; {term.experiment}" if term.experiment else ""
-        rows.append(("unnamed", term.channel, _describe(term), f"{term.evidence:.0f}", also, place + test))
+        rows.append(("unnamed", term.channel, _describe(term), "", f"{term.evidence:.0f}", also, place + test))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
-    head = ("effect", "channel", "parameters with 95 % intervals", "evidence", "confounded with", "what would decide")
-    return _table(head, rows)
+    head = (
+        "effect", "channel", "parameters with 95 % intervals", "in model.toml", "evidence", "confounded with",
+        "what would decide",
+    )  # fmt: skip
+    return _table(head, rows) + "".join(f"<p>{escape(line)}.</p>" for line in _why_values_differ(report))
 
 
 def _gap(of: Mapping[str, Mapping[float, PredictionErrors]]) -> str:

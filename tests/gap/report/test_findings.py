@@ -129,6 +129,23 @@ def test_the_answer_credits_the_effects_of_the_model_that_is_written_and_marks_t
     assert "with command_delay (doubtful), motor_lag and what no model can hold (amended);" in summary_lines(without)[1]
 
 
+def test_the_values_of_the_model_stand_beside_those_found_with_the_reason_why_they_differ():
+    found = (effect("motor_lag", 0.001, tau_s=0.1), effect("turn_slip", k_s=0.12))
+    model = Model(0.06, 0.4, effects=(EffectSetting("motor_lag", {"tau_s": 0.1234}),))
+    both = replace(report(0.014), effects=found, model=model)
+    why = "model.toml's values are fitted to whole predictions, from commands to poses, and may lie outside"
+    text, html = as_text(both), page(both).replace("&#x27;", "'")
+    assert "command_to_wheel: motor_lag: tau_s 0.1 [0.099, 0.101], 0.1234 in model.toml" in text
+    assert "command_to_wheel: turn_slip: k_s 0.12 [0.12, 0.12], not in model.toml" in text
+    assert why in text
+    assert why in html
+    assert "<td>tau_s = 0.1 [0.099, 0.101]</td><td>tau_s = 0.1234</td>" in html
+    assert "<td>k_s = 0.12 [0.12, 0.12]</td><td>not in it</td>" in html
+    same = replace(both, model=Model(0.06, 0.4, effects=(EffectSetting("motor_lag", {"tau_s": 0.1}),)))
+    assert why not in as_text(same)
+    assert why not in page(same).replace("&#x27;", "'")
+
+
 def test_one_drive_is_asked_for():
     assert report(0.014).drive is None
     assert report(0.014, blind=("turn_slip", "yaw_rate_limit")).drive == "disco-hw drive ROBOT.toml --script spins"
