@@ -85,7 +85,8 @@ def check_adaptable(model: Model, uncertainty: str, requested_by: str = "--adapt
             f"{requested_by}: the model has no belief over wheel radius, axial distance and x_icr; "
             "write one with `disco-hw infer`"
         )
-    others = [s.name for s in model.effects if s.effect.channel is not Channel.COMMAND_TO_WHEEL]
+    # Encoders that miscount are among them. No model corrects poses: effects of their sensor are counted nowhere else.
+    others = [s.name for s in model.effects if s.effect.channel is Channel.WHEEL_TO_BODY]
     if others:
         raise InputError(
             f"{requested_by}: the model has the effect {others[0]}, which adaptation would mistake for a change of "

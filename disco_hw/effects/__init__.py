@@ -190,6 +190,10 @@ class Mimicked:
         return found
 
 
+Wording = str | Callable[[Mapping[str, float]], str]
+"""A text with `{parameter}` fields, or what returns it for the parameters' values."""
+
+
 def parameters_as_they_are(values: Array, base: Array, step_s: float) -> tuple[Array, ...]:
     """Return the parameters themselves, (L,) each: the coefficients of an effect that needs no others."""
     return tuple(values.T)
@@ -208,8 +212,10 @@ class Effect:
 
     How it is reported: `sentence` for a report, with `{parameter}` fields, of a time `{parameter_s}` in s or
     `{parameter_ms}` in ms; `sentence_below` in its place where the first parameter is below zero, with its size;
-    `other_symptoms`, pairs of a parameter and what follows the sentence where that one is known, too; `excitation`, the
-    manoeuvre that shows it, and `script`, the one of `disco-hw drive --script` that drives it; `symptoms`.
+    `other_symptoms`, pairs of a parameter and what follows the sentence where that one is known, too, a text or a
+    function that returns it for the values; `excitation`, the manoeuvre that shows it, and `script`, the one of
+    `disco-hw drive --script` that drives it; `symptoms`; `pose_key`, the key of [pose] in robot.toml that corrects it,
+    and the sign with which its parameters are added there.
 
     Traits: `uses_geometry`, whether its coefficients depend on the geometry; `may_turn_more`, whether it can make the
     robot turn faster than its wheels say; `delayed_by`, the parameter that is the delay of the wheels behind commands,
@@ -237,8 +243,9 @@ class Effect:
     coefficients: Callable[[Array, Array, float], tuple[Array, ...]] = parameters_as_they_are
     order: int = 0
     sentence_below: str | None = None
-    other_symptoms: tuple[tuple[str, str], ...] = ()
+    other_symptoms: tuple[tuple[str, Wording], ...] = ()
     symptoms: tuple[Symptom, ...] = ()
+    pose_key: tuple[str, float] | None = None
     uses_geometry: bool = False
     may_turn_more: bool = False
     delayed_by: str | None = None
@@ -284,6 +291,18 @@ class Effect:
         if differs and not self.uses_geometry:
             raise ValueError(f"{self.name}: its coefficients depend on the geometry; say uses_geometry=True")
 
+    def possible(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Return the nearest values in the parameters' ranges, but a first one of which `sentence_below` tells."""
+        inside = {
+            parameter.name: min(max(values[parameter.name], parameter.low), parameter.high)
+            for parameter in self.parameters
+            if parameter.name in values
+        }
+        first = self.parameters[0].name
+        if self.sentence_below is not None and first in values:
+            inside[first] = values[first]
+        return inside
+
     def describe(self, values: Mapping[str, float]) -> str:
         """Return the sentence with these values of the parameters."""
         first = self.parameters[0].name
@@ -291,11 +310,19 @@ class Effect:
             return self.fill(self.sentence_below, {**values, first: -values[first]})
         return self.fill(self.sentence, values)
 
-    def fill(self, text: str, values: Mapping[str, float]) -> str:
+    def fill(self, wording: Wording, values: Mapping[str, float]) -> str:
         """Fill the fields of a text with values of the parameters, times in s or in ms."""
+        text = wording if isinstance(wording, str) else wording(values)
         times = {name: value for name, value in values.items() if name.endswith("_s")}
         in_ms = {f"{name.removesuffix('_s')}_ms": 1e3 * value for name, value in times.items()}
         return text.format(**in_ms, **values)
+
+    def pose_correction(self, values: Mapping[str, float]) -> tuple[str, tuple[float, ...]] | None:
+        """Return the key of [pose] that corrects the effect, and what is to be added to it; None without such a key."""
+        if self.pose_key is None:
+            return None
+        key, sign = self.pose_key
+        return key, tuple(sign * values[parameter.name] for parameter in self.parameters if parameter.name in values)
 
     @property
     def moves(self) -> bool:

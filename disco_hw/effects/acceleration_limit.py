@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from disco_hw.jit import cast_like, scalar_function
 _STOP_RAD_S = 0.02
 # A stop that takes no more than this share of the time is at once.
 _LEAST_SHARE = 1e-3
+# Chosen: below this share no operator sees a ramp in a stop.
+_TOLD_AT_ONCE = 0.05
 # How long the fastest speed that was commanded takes to reach, where a fit begins (s).
 RISES_S = (0.3, 1.0, 4.0)
 
@@ -72,6 +75,12 @@ def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
     return tuple((ramp, stop_share) for ramp in ramps for stop_share in (1.0, 0.05))
 
 
+def stop_wording(values: Mapping[str, float]) -> str:
+    """Return the text on how long a stop takes."""
+    at_once = values["stop_share"] <= _TOLD_AT_ONCE
+    return "a wheel stops at once" if at_once else "a stop takes {stop_share:.2f} of that time"
+
+
 EFFECT = Effect(
     name="acceleration_limit",
     channel=Channel.COMMAND_TO_WHEEL,
@@ -88,6 +97,6 @@ EFFECT = Effect(
     trials=(50.0, 30.0, 20.0, 12.0, 8.0, 5.0, 3.0, 2.0, 1.0, 0.5),
     excitation="steps of the wheel command, from rest and back to it",
     script="starts",
-    sentence="each wheel's speed changes by no more than {limit_rad_s2:.2f} rad/s^2, "
-    "and takes {stop_share:.2f} of that time to a stop",
+    sentence="each wheel's speed changes by no more than {limit_rad_s2:.2f} rad/s^2",
+    other_symptoms=(("stop_share", stop_wording),),
 )

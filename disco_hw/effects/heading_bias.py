@@ -19,6 +19,7 @@ EFFECT = Effect(
     parameters=(Parameter("bias_rad", "rad", -3.2, 3.2, 0.0, realistic=0.026),),
     plain=plain,
     symptoms=(Symptom.SIDEWAYS_WITH_SPEED, Symptom.FORWARD_WITH_TURNING),
+    pose_key=("yaw_offset_rad", -1.0),
     excitation="straights and fast steering",
     script="curves",
     sentence="the measured yaw is {bias_rad:+.4f} rad off",

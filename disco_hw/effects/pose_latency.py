@@ -21,6 +21,7 @@ EFFECT = Effect(
     parameters=(Parameter("latency_s", "s", -1.0, 2.0, 0.05, realistic=0.04),),
     plain=plain,
     symptoms=(Symptom.DELAYED_POSITIONS, Symptom.DELAYED_YAW),
+    pose_key=("latency_s", 1.0),
     excitation="fast steering and start-stops",
     script="starts",
     sentence="poses are stamped {latency_ms:.0f} ms late",

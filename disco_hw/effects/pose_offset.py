@@ -23,6 +23,7 @@ EFFECT = Effect(
     plain=plain,
     mimics=Mimicked(lateral_icr, "measure the pose sensor's mount with a ruler, or move the payload and drive again"),
     symptoms=(Symptom.FORWARD_WITH_TURNING,),
+    pose_key=("offset", 1.0),
     excitation="turning on the spot, both ways",
     script="spins",
     sentence="the pose sensor sits {forward_m:+.3f} m forward and {left_m:+.3f} m to the left of the tracked point",

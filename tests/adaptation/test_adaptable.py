@@ -14,6 +14,8 @@ from disco_hw.adaptation.guard import (
     with_geometry,
 )
 from disco_hw.config import SHIPPED_ROBOT, Control, PoseInput, Prior
+from disco_hw.effects import Channel
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError
 from disco_hw.model import EffectSetting, Gaussian, load_model
 
@@ -43,6 +45,16 @@ def test_what_cannot_be_adapted_is_refused():
         check_adaptable(replace(MODEL, belief=None), "ut")
     with pytest.raises(InputError, match="side_slip"):
         check_adaptable(replace(MODEL, effects=(EffectSetting("side_slip", {"k_s": 0.1}),)), "ut")
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_only_effects_between_wheel_and_body_forbid_it_of_which_encoders_are_one(name):
+    effect = REGISTRY[name]
+    setting = EffectSetting(name, {parameter.name: parameter.start for parameter in effect.parameters})
+    chosen = choose_adaptation(Control(), PoseInput(), replace(MODEL, effects=(setting,)))
+    assert chosen.kind == ("off" if effect.channel is Channel.WHEEL_TO_BODY else "fast")
+    assert name != "encoder_scale" or chosen.kind == "off"
+    assert name != "heading_bias" or chosen.kind == "fast"
 
 
 def test_the_geometry_is_learnt_where_the_model_allows_it():

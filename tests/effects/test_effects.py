@@ -6,10 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from disco_hw.effects import Channel, encoder_scale, heading_bias, pose_latency, pose_offset
+from disco_hw.config import PoseInput
+from disco_hw.effects import Channel, Stage, encoder_scale, heading_bias, pose_latency, pose_offset
 from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.model import EffectSetting, Model, plain
 from disco_hw.model.step import FreeRun
+from drivers.pose import PoseConvention
+from drivers.types import PoseSample
 from tests.model.reference import reference_run
 from tools.compile_kernels import model_with_every_effect
 
@@ -85,6 +88,30 @@ def test_effects_describe_themselves(effect):
 )
 def test_a_time_is_told_in_words_and_none_is_negative(name, value, description):
     assert REGISTRY[name].describe({REGISTRY[name].parameters[0].name: value}) == description
+
+
+@pytest.mark.parametrize("name", sorted(NAMES[Channel.POSE_SENSOR]))
+def test_what_the_pose_sensor_does_is_undone_by_its_key_of_robot_toml(name):
+    effect, true = REGISTRY[name], (1.0, 2.0, 0.7)
+    values = dict(zip((p.name for p in effect.parameters), (0.12, -0.05), strict=False))
+    key, correction = effect.pose_correction(values)
+    time_s, pose = 3.0, true
+    if effect.stage is Stage.POSE_TIME:
+        time_s += values["latency_s"]
+        assert effect.plain(time_s, tuple(values.values())) == pytest.approx(3.0)
+    else:
+        pose = effect.plain(*true, tuple(values.values()))
+    measured = PoseSample(round(1e9 * time_s), 0, *map(float, pose), 0.01, 0.01)
+    setting = correction[0] if len(correction) == 1 else correction
+    found = PoseConvention(**{key: setting}).converted(measured)
+    assert (found.x_m, found.y_m, found.yaw_rad) == pytest.approx(true)
+    assert found.t_ns == pytest.approx(3e9)
+    # robot.toml takes it, too.
+    assert key in PoseInput.__struct_fields__
+
+
+def test_only_the_pose_sensor_is_corrected_by_robot_toml():
+    assert {name for name, one in REGISTRY.items() if one.pose_key is not None} == NAMES[Channel.POSE_SENSOR]
 
 
 @pytest.mark.parametrize("other_symptoms", [(("no", "no"),), (("unequal", "wheels are {no}"),)])

@@ -102,9 +102,11 @@ def report_of(name, timed_m, amended_m, offered="amended"):
     effect = EffectFinding(
         name, "command_to_wheel", {REGISTRY[name].parameters[0].name: ParameterEstimate(0.1234, 0.1, 0.15)}, 50.0
     )
+    values = {p.name: p.start for p in REGISTRY[name].parameters}
+    effects = (EffectSetting(name, values),) if offered == "amended" else ()
     return GapReport(
-        (name,), (), (effect,), (UnnamedFinding("wheel_to_body", "v_x += 3 v", 30.0),), (), gap, Model(0.06, 0.4),
-        1.0, offered, doubtful=(LowConfidence("slope", "at its bound"),),
+        (name,), (), (effect,), (UnnamedFinding("wheel_to_body", "v_x += 3 v", 30.0),), (), gap,
+        Model(0.06, 0.4, effects=effects), 1.0, offered, doubtful=(LowConfidence("slope", "at its bound"),),
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 
 from disco_hw import reports
+from disco_hw.effects import Stage
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap.report import STAGES, EffectFinding, GapReport, UnnamedFinding
 from disco_hw.gap.report.events import RareEvent
@@ -25,9 +26,9 @@ def other_known_symptoms(effect: EffectFinding, settings: ReportSettings = DEFAU
 
 
 def sentence(effect: EffectFinding, settings: ReportSettings = DEFAULT_SETTINGS.report) -> str:
-    """Describe what a missing effect does, with its values."""
+    """Describe what a missing effect does, with its values, or the nearest ones that are possible."""
     described = REGISTRY[effect.name]
-    values = {name: estimate.value for name, estimate in effect.parameters.items()}
+    values = described.possible({name: estimate.value for name, estimate in effect.parameters.items()})
     others = dict(described.other_symptoms)
     also = (described.fill(others[name], values) for name in other_known_symptoms(effect, settings))
     return "; ".join((described.describe(values), *also))
@@ -40,18 +41,13 @@ def summary_lines(report: GapReport) -> list[str]:
     """
     most = report.settings.report.most_listed
     effects = report.effects[:most]
-    lines = [f"{text[0].upper()}{text[1:]}." for text in (sentence(each, report.settings.report) for each in effects)]
-    more = len(report.effects) - len(effects)
-    if more:
-        lines[-1] += f" And {more} more, listed below."
-    if not effects and report.unnamed:
-        lines.append(f"Something is missing that has no name: {_describe(report.unnamed[0])}.")
-    elif not effects and (report.residue or report.doubtful):
-        lines.append("Something is missing that none of the known effects explains.")
-    elif not effects:
-        lines.append("Nothing is missing that this log could show.")
+    lines = _missing(report, effects)
     if effects:
         lines.append(f"How sure: with 95 % probability {'; '.join(_range(each) for each in effects)}.")
+    corrections = [text for each in report.effects if (text := _pose_correction(each)) is not None]
+    if corrections:
+        where = "Correct the pose sensor in [pose] of robot.toml, as no model does (a missing key is 0)"
+        lines.append(f"{where}: {'; '.join(corrections)}.")
     if report.events:
         told = sorted(report.events, key=lambda event: -event.share)[:most]
         text = "; ".join(event.describe() for event in sorted(told, key=report.events.index))
@@ -69,6 +65,40 @@ def summary_lines(report: GapReport) -> list[str]:
     if report.provenance is not None:
         lines.append(f"Go on: `{report.provenance.go_on}`.")
     return lines
+
+
+def _missing(report: GapReport, effects: Sequence[EffectFinding]) -> list[str]:
+    """Describe what is missing: these effects with a mark on those that the model leaves out, or else what there is."""
+    written = {setting.name for setting in report.model.effects}
+    lines = []
+    for each in effects:
+        text = sentence(each, report.settings.report)
+        lines.append(f"{text[0].upper()}{text[1:]}{'' if each.name in written else ' (not in model.toml)'}.")
+    more = len(report.effects) - len(effects)
+    if more:
+        lines[-1] += f" And {more} more, listed below."
+    if not effects and report.unnamed:
+        lines.append(f"Something is missing that has no name: {_describe(report.unnamed[0])}.")
+    elif not effects and (report.residue or report.doubtful):
+        if report.remains is None or not report.remains.is_explained:
+            lines.append("Something is missing that none of the known effects explains.")
+    elif not effects:
+        lines.append("Nothing is missing that this log could show.")
+    return lines
+
+
+def _pose_correction(effect: EffectFinding) -> str | None:
+    """Describe what is to be added to which key of [pose] for an effect of the pose sensor; None for any other."""
+    described = REGISTRY[effect.name]
+    correction = described.pose_correction({name: estimate.value for name, estimate in effect.parameters.items()})
+    if correction is None:
+        return None
+    key, added = correction
+    value = ", ".join(f"{each:+.4f}" for each in added)
+    text = f"add {f'[{value}]' if len(added) > 1 else value} {described.parameters[0].unit} to {key}"
+    if described.stage is Stage.POSE_TIME and added[0] < 0.0:
+        text += ", and where that falls below 0 correct the stamps at their source"
+    return text
 
 
 def _range(effect: EffectFinding) -> str:
@@ -98,7 +128,7 @@ def _gap_line(report: GapReport) -> str:
     last = f"the sensors' noise makes {off['floor']}" if "floor" in off else f"the model as given by {off['nominal']}"
     line = (
         f"{horizon} ahead, in parts of the log that were not used, {'predictions' if report.gap else 'the wheels'} "
-        f"are off by {off['timed']} with a delay and a lag alone (timed), by {off['amended']} with what was found "
+        f"are off by {off['timed']} with a delay and a lag alone (timed), by {off['amended']} with {_added(report)} "
         f"(amended); {last}."
     )
     if "written" in off:
@@ -106,15 +136,40 @@ def _gap_line(report: GapReport) -> str:
     if report.why_not_amended is None:
         return line
     offered = report.offered if report.gap or report.offered == "timed" else "given"
-    return f"{line} Drive with the {offered} model, which is in model.toml. {report.why_not_amended}"
+    names = _names_in_model(report)
+    return (
+        f"{line} Drive with the {offered} model, which is in model.toml{f', with {names}' if names else ''}. "
+        f"{report.why_not_amended}"
+    )
+
+
+def _names_in_model(report: GapReport) -> str:
+    """List the effects of the model that is handed out, with those marked that are doubtful; empty without any."""
+    doubtful = {one.name for one in report.doubtful}
+    names = (setting.name for setting in report.model.effects)
+    return ", ".join(f"{name} (doubtful)" if name in doubtful else name for name in names)
+
+
+def _added(report: GapReport) -> str:
+    """Describe what the amended model has, of which only the one that is handed out is known by its effects."""
+    if report.why_not_amended is not None:
+        return "more effects"
+    names = _names_in_model(report) or "no effect"
+    return f"{names} and what no model can hold" if "written" in (report.gap or report.wheels) else names
 
 
 def as_text(report: GapReport) -> str:
     """Format the report as text for a terminal."""
     lines = [*(f"warning: {warning}" for warning in report.warnings), *summary_lines(report), ""]
     for effect in report.effects:
-        values = ", ".join(f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-        lines.append(f"{effect.channel}: {effect.name}: {values}{_confounded(effect)}")
+        written = _values_in_model(report, effect)
+        values = ", ".join(
+            f"{n} {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]{f', {written[n]} in model.toml' if n in written else ''}"
+            for n, e in effect.parameters.items()
+        )
+        out = "" if written else ", not in model.toml"
+        lines.append(f"{effect.channel}: {effect.name}: {values}{out}{_confounded(effect)}")
+    lines += _why_values_differ(report)
     lines += [f"{term.channel}: unnamed: {_describe(term)}{_confounded(term)}" for term in report.unnamed]
     lines += [f"doubtful: {one.name}: {one.why}" for one in report.doubtful]
     lines += [f"event: {_describe_event(event)}" for event in report.events]
@@ -127,6 +182,30 @@ def as_text(report: GapReport) -> str:
             cells = (_in_cell(of[stage][horizon]) for stage in of)
             lines.append(f"{horizon:4g} s  " + " ".join(f"{cell:>20}" for cell in cells))
     return "\n".join(lines)
+
+
+def _values_in_model(report: GapReport, effect: EffectFinding) -> dict[str, str]:
+    """Return the parameters that model.toml has of an effect, formatted; empty if it lacks the effect."""
+    settings = (setting for setting in report.model.effects if setting.name == effect.name)
+    return {name: f"{value:.4g}" for setting in settings for name, value in setting.values.items()}
+
+
+def _why_values_differ(report: GapReport) -> list[str]:
+    """Return a sentence on why model.toml has other values than were found; none where it has the same.
+
+    Without poses there are no predictions of the whole chain, and nothing is fitted to them.
+    """
+    pairs = (
+        (f"{found.value:.4g}", _values_in_model(report, effect).get(name))
+        for effect in report.effects
+        for name, found in effect.parameters.items()
+    )
+    if not report.gap or all(written is None or written == found for found, written in pairs):
+        return []
+    return [
+        "model.toml's values are fitted to whole predictions, from commands to poses, and may lie outside the "
+        "intervals, which are of one channel at a time"
+    ]
 
 
 def _describe_logs(report: GapReport) -> list[str]:
@@ -175,7 +254,7 @@ _DEFINITIONS = {
     "nominal": "the model as given",
     "refitted": "its wheel radius, axial distance and centre of turning fitted, from commands to poses",
     "timed": "a command delay and a motor lag too: what a careful engineer fits by hand",
-    "amended": "with everything that was found",
+    "amended": "with what was found, as far as predictions need it",
     "floor": "what the noise of the sensors makes of a perfect model",
     "held out": "predicted by what was fitted on other stretches of the log",
     "evidence": "twice the gain in log likelihood, less the price of the parameters",
@@ -271,18 +350,22 @@ def _effects(report: GapReport) -> str:
     rows = []
     for effect in report.effects:
         values = ", ".join(f"{n} = {e.value:.4g} [{e.low:.4g}, {e.high:.4g}]" for n, e in effect.parameters.items())
-        also = ", ".join(effect.indistinguishable_from)
-        rows.append((effect.name, effect.channel, values, f"{effect.evidence:.0f}", also, effect.experiment or ""))
+        of_model = ", ".join(f"{n} = {value}" for n, value in _values_in_model(report, effect).items()) or "not in it"
+        also, test = ", ".join(effect.indistinguishable_from), effect.experiment or ""
+        rows.append((effect.name, effect.channel, values, of_model, f"{effect.evidence:.0f}", also, test))
     for term in report.unnamed:
         place = (
             "in the amended model" if term.in_model else "not in the model: it depends on what no model's state holds"
         )
         also, test = ", ".join(term.indistinguishable_from), f"; {term.experiment}" if term.experiment else ""
-        rows.append(("unnamed", term.channel, _describe(term), f"{term.evidence:.0f}", also, place + test))
+        rows.append(("unnamed", term.channel, _describe(term), "", f"{term.evidence:.0f}", also, place + test))
     if not rows:
         return "<p>Nothing that this log shows.</p>"
-    head = ("effect", "channel", "parameters with 95 % intervals", "evidence", "confounded with", "what would decide")
-    return _table(head, rows)
+    head = (
+        "effect", "channel", "parameters with 95 % intervals", "in model.toml", "evidence", "confounded with",
+        "what would decide",
+    )  # fmt: skip
+    return _table(head, rows) + "".join(f"<p>{escape(line)}.</p>" for line in _why_values_differ(report))
 
 
 def _gap(of: Mapping[str, Mapping[float, PredictionErrors]]) -> str:

@@ -20,6 +20,8 @@ _WHILE = {
 }
 # Errors of more than so many times the sensors' noise are only partly explained.
 _EXPLAINED = 2.0
+# Chosen: errors above the noise by no more than this share of it are the noise, as well as that is known.
+_LEAST_GAP = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,9 +61,11 @@ class Remains:
 
     @property
     def closed(self) -> tuple[float | None, float | None]:
-        """Share of the gap between `timed` and noise that is closed: position, heading; None for one without a gap."""
+        """Share of the gap between `timed` and noise that is closed, 0 to 1: position, heading; None for no gap."""
         ends = zip(self.before, self.after, self.floor, strict=True)
-        position, heading = ((b - a) / (b - f) if b > f else None for b, a, f in ends)
+        position, heading = (
+            min(max((b - a) / (b - f), 0.0), 1.0) if b > (1.0 + _LEAST_GAP) * f else None for b, a, f in ends
+        )
         return position, heading
 
     @property

@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import pytest
 
+from disco_hw.effects.registry import REGISTRY
 from disco_hw.gap import offered_stage
-from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, Provenance, UnnamedFinding
+from disco_hw.gap.report import STAGES, AcrossLogs, EffectFinding, GapReport, LowConfidence, Provenance, UnnamedFinding
 from disco_hw.gap.report.blind_spots import BlindSpot
 from disco_hw.gap.report.page import as_text, page, sentence, summary_lines
 from disco_hw.gap.search.channel_result import ParameterEstimate
 from disco_hw.gap.search.cross_validation import PredictionErrors
 from disco_hw.gap.settings import DEFAULT_SETTINGS
-from disco_hw.model import Model
+from disco_hw.model import EffectSetting, Model
 from disco_hw.model.terms import TERMS
 from disco_hw.reports import as_json
 
@@ -47,7 +48,7 @@ def report(amended_m, yaw_rad=0.02, blind=(), offered="amended"):
 def test_the_answer_has_the_gap_before_and_after_and_the_noise():
     assert summary_lines(report(0.014))[1] == (
         "2 s ahead, in parts of the log that were not used, predictions are off by 47 mm and 0.02 rad with a delay "
-        "and a lag alone (timed), by 14 mm and 0.02 rad with what was found (amended); the sensors' noise makes 14 mm "
+        "and a lag alone (timed), by 14 mm and 0.02 rad with no effect (amended); the sensors' noise makes 14 mm "
         "and 0.02 rad."
     )
 
@@ -104,6 +105,47 @@ def test_a_model_that_lacks_what_no_model_can_carry_is_judged_without_it(written
     assert said in page(of)
 
 
+def model_with(*names):
+    """A model with these effects."""
+    effects = (EffectSetting(name, {p.name: p.start for p in REGISTRY[name].parameters}) for name in names)
+    return Model(0.06, 0.4, effects=tuple(effects))
+
+
+def test_the_answer_credits_the_effects_of_the_model_that_is_written_and_marks_those_that_it_leaves_out():
+    found = replace(
+        report(0.014),
+        effects=(effect("motor_lag", tau_s=0.1), effect("turn_slip", k_s=0.12)),
+        doubtful=(LowConfidence("command_delay", "hardly known"),),
+        model=model_with("command_delay", "motor_lag"),
+    )
+    lines = summary_lines(found)
+    assert lines[0].endswith("with a time constant of 100 ms.")
+    assert lines[1].endswith(" (not in model.toml).")
+    assert "rad with command_delay (doubtful), motor_lag (amended);" in lines[3]
+    timed = summary_lines(replace(found, gap=report(0.052).gap, offered="timed"))[3]
+    assert "rad with more effects (amended);" in timed
+    assert "in model.toml, with command_delay (doubtful), motor_lag. The amended model has more effects" in timed
+    without = replace(without_its_terms(0.02), model=found.model, doubtful=found.doubtful)
+    assert "with command_delay (doubtful), motor_lag and what no model can hold (amended);" in summary_lines(without)[1]
+
+
+def test_the_values_of_the_model_stand_beside_those_found_with_the_reason_why_they_differ():
+    found = (effect("motor_lag", 0.001, tau_s=0.1), effect("turn_slip", k_s=0.12))
+    model = Model(0.06, 0.4, effects=(EffectSetting("motor_lag", {"tau_s": 0.1234}),))
+    both = replace(report(0.014), effects=found, model=model)
+    why = "model.toml's values are fitted to whole predictions, from commands to poses, and may lie outside"
+    text, html = as_text(both), page(both).replace("&#x27;", "'")
+    assert "command_to_wheel: motor_lag: tau_s 0.1 [0.099, 0.101], 0.1234 in model.toml" in text
+    assert "command_to_wheel: turn_slip: k_s 0.12 [0.12, 0.12], not in model.toml" in text
+    assert why in text
+    assert why in html
+    assert "<td>tau_s = 0.1 [0.099, 0.101]</td><td>tau_s = 0.1234</td>" in html
+    assert "<td>k_s = 0.12 [0.12, 0.12]</td><td>not in it</td>" in html
+    same = replace(both, model=Model(0.06, 0.4, effects=(EffectSetting("motor_lag", {"tau_s": 0.1}),)))
+    assert why not in as_text(same)
+    assert why not in page(same).replace("&#x27;", "'")
+
+
 def test_one_drive_is_asked_for():
     assert report(0.014).drive is None
     assert report(0.014, blind=("turn_slip", "yaw_rate_limit")).drive == "disco-hw drive ROBOT.toml --script spins"
@@ -144,6 +186,23 @@ def test_that_wheels_are_unequal_is_said_where_only_their_load_shows_it_and_it_i
     line = summary_lines(replace(report(0.014), effects=(load,)))[0]
     assert line.startswith("Turning takes 0.53 rad/s from each side's wheels, however fast the robot turns")
     assert ("the right wheels are -0.95% larger than the mean" in line) is said
+
+
+@pytest.mark.parametrize(
+    ("stop_share", "wide", "said"),
+    [
+        (-0.003, 0.01, "; a wheel stops at once"),
+        (0.03, 0.01, "; a wheel stops at once"),
+        (0.5, 0.1, "; a stop takes 0.50 of that time"),
+        # What is hardly known is not told.
+        (-0.003, 2.94, ""),
+    ],
+)
+def test_a_value_outside_what_is_possible_is_told_as_the_nearest_that_is(stop_share, wide, said):
+    limit = effect("acceleration_limit", wide, limit_rad_s2=0.342, stop_share=stop_share)
+    assert sentence(limit) == f"each wheel's speed changes by no more than 0.34 rad/s^2{said}"
+    below = effect("acceleration_limit", wide, limit_rad_s2=0.01, stop_share=stop_share)
+    assert sentence(below).startswith("each wheel's speed changes by no more than 0.05 rad/s^2")
 
 
 @pytest.mark.parametrize(("delay_s", "wrong"), [(0.12, False), (-0.17, True)])
@@ -206,6 +265,21 @@ def test_an_answer_of_many_names_is_short():
     assert "more" not in " ".join(few[:3])
     next_drive = "Drive next: `disco-hw drive ROBOT.toml --script spins`; this log could not have shown turn_"
     assert few[5].startswith(next_drive)
+
+
+def test_what_the_pose_sensor_does_is_corrected_in_robot_toml():
+    bias, early = effect("heading_bias", 0.002, bias_rad=0.0499), effect("pose_latency", 0.01, latency_s=-0.065)
+    beside = effect("pose_offset", 0.01, forward_m=0.02, left_m=-0.03)
+    lines = summary_lines(replace(report(0.014), effects=(bias, early, beside)))
+    assert lines[4] == (
+        "Correct the pose sensor in [pose] of robot.toml, as no model does (a missing key is 0): add -0.0499 rad to "
+        "yaw_offset_rad; add -0.0650 s to latency_s, and where that falls below 0 correct the stamps at their source; "
+        "add [+0.0200, -0.0300] m to offset."
+    )
+    late = summary_lines(replace(report(0.014), effects=(effect("pose_latency", 0.01, latency_s=0.0897),)))
+    assert late[2].endswith(": add +0.0897 s to latency_s.")
+    other = replace(report(0.014), effects=(effect("motor_lag", tau_s=0.1),))
+    assert "robot.toml" not in " ".join(summary_lines(other))
 
 
 def test_what_logs_share_is_told_apart_from_what_differs():

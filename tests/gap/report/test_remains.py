@@ -26,9 +26,28 @@ def test_the_share_of_the_gap_to_the_noise_that_is_closed_is_of_position_and_of_
     remains = Remains.of(TIMED, errors(0.02, 0.10), FLOOR, None)
     assert remains.closed == pytest.approx((0.75, 0.0))
     assert remains.as_dict()["closed_position"] == pytest.approx(0.75)
-    # Where `timed` errs by the noise there is no gap, and a model that errs by more has closed less than none.
+    # Where `timed` errs by the noise there is no gap, and a model that errs by more has closed none.
     assert Remains.of(FLOOR, FLOOR, FLOOR, None).closed == (None, None)
-    assert Remains.of(TIMED, errors(0.07, 0.06), FLOOR, None).closed == pytest.approx((-0.5, 0.5))
+    assert Remains.of(TIMED, errors(0.07, 0.06), FLOOR, None).closed == pytest.approx((0.0, 0.5))
+
+
+def test_no_share_is_told_of_a_gap_as_small_as_what_the_noise_is_known_by_nor_more_than_all_of_it():
+    # A robot of which all was found: in position there was next to nothing to explain.
+    found = Remains.of(errors(0.00469, 0.013), errors(0.00446, 0.0040), errors(0.00464, 0.0041), None)
+    assert found.closed == (None, 1.0)
+    assert found.describe() == "Of what is more than the sensors' noise this explains 100% in heading."
+    assert found.as_dict()["closed_position"] is None
+
+
+def test_that_something_is_missing_is_not_said_of_a_robot_predicted_to_the_noise():
+    residue = ("command_to_wheel: speeding up still disagrees: 5.5 times the noise",)
+    bare = replace(report_of("motor_lag", 0.05, 0.02), effects=(), unnamed=(), doubtful=(), residue=residue)
+    missing = "Something is missing that none of the known effects explains."
+    said = summary_lines(replace(bare, remains=Remains.of(FLOOR, FLOOR, FLOOR, None)))
+    assert missing not in said
+    assert "What is left is the sensors' noise." in said
+    assert missing in summary_lines(replace(bare, remains=Remains.of(TIMED, TIMED, FLOOR, None)))
+    assert missing in summary_lines(bare)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +111,7 @@ def test_the_answer_says_how_sure_how_much_is_explained_and_in_at_most_ten_lines
     assert len(lines) <= 10
     early = EffectFinding("pose_latency", "pose_sensor", {"latency_s": ParameterEstimate(-0.065, -0.07, -0.06)}, 9.0)
     assert summary_lines(replace(found, effects=(early,)))[:2] == [
-        "Poses are stamped 65 ms early.",
+        "Poses are stamped 65 ms early (not in model.toml).",
         "How sure: with 95 % probability pose_latency is between 0.06 and 0.07 s.",
     ]
 
