@@ -23,6 +23,8 @@ SPACING_M = 0.02
 REFINED_SPACING_M = 0.01
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01
+# Chosen: ends this close are meant to meet, as where the file rounds or somebody recorded a lap by hand.
+CLOSED_M = 0.02
 LOOK_BACK_M = 0.3
 LOOK_AHEAD_M = 1.0
 LOST_M = 1.0
@@ -42,12 +44,18 @@ class PathTable:
     """Way-points (N, 2) in equal pieces of arc length, of about `nominal_spacing_m`; immutable.
 
     Where the way turns sharply it is cut into pieces: the robot stops at a piece's end and turns to the next. The path
-    is `closed` if its last way-point is its first. `table`: x, y (m) of each entry, and the unit tangent of the piece
-    that begins there; `spacing_m`: arc length between two entries. Raises ValueError for way-points closer than the
-    table's spacing throughout.
+    is `closed` if its last way-point is within CLOSED_M of its first, and then ends there. `table`: x, y (m) of each
+    entry, and the unit tangent of the piece that begins there; `spacing_m`: arc length between two entries. Raises
+    ValueError for way-points closer than the table's spacing throughout.
     """
 
     def __init__(self, places_m: Array, nominal_spacing_m: float = SPACING_M) -> None:
+        from_first_m = np.hypot(*(places_m - places_m[0]).T)
+        self.closed = closed = bool(from_first_m[-1] < CLOSED_M)
+        if closed and from_first_m[-1] > 0.0 and from_first_m.max() >= CLOSED_M:
+            # Without those about the first, which may lie beyond it: the way would turn back to it.
+            last = int(np.flatnonzero(from_first_m >= CLOSED_M)[-1])
+            places_m = np.vstack([places_m[: last + 1], places_m[:1]])
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m, axis=0).T))])
         count = round(distance[-1] / nominal_spacing_m)
         if count < 1:
@@ -59,7 +67,6 @@ class PathTable:
         (folds,) = np.nonzero(np.hypot(np.diff(x), np.diff(y)) < FOLDED * distance[-1] / count)
         turns = np.searchsorted(distance, at[folds], side="right")
         x[folds], y[folds] = places_m[turns].T
-        self.closed = closed = bool(np.hypot(*(places_m[0] - places_m[-1])) < nominal_spacing_m)
         self.spacing_m: float = float(distance[-1]) / count
         corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / self.spacing_m)))
         x, y = _rounded(np.column_stack([x, y]), closed).T

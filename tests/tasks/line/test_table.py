@@ -70,3 +70,26 @@ def test_refined_plans_follow_a_finer_table(length_m, mode, spacing_m):
     assert table.spacing_m == pytest.approx(spacing_m, rel=1e-3)
     corner = np.hypot(*(table.table[:, :2] - (side_m, 0.0)).T).min()
     assert corner <= 0.5 * spacing_m
+
+
+def ring(gap_m, way_m):
+    """A circle of 0.6 m whose last way-point is so far before the first, with so much between way-points."""
+    angle = np.linspace(0.0, 2.0 * np.pi - gap_m / 0.6, round(3.8 / way_m))
+    return tuple(zip(0.6 * np.sin(angle), 0.6 - 0.6 * np.cos(angle), strict=True))
+
+
+@pytest.mark.parametrize("way_m", [0.05, 0.004])
+@pytest.mark.parametrize("gap_m", [0.0, 0.011, 0.015, 0.019, -0.015])
+def test_a_path_is_closed_whatever_its_table_if_its_ends_are_within_2_cm(gap_m, way_m):
+    for mode in ("default", "sampled"):
+        path = planned_table(ring(gap_m, way_m), mode)
+        assert path.closed
+        assert path.table[-1, :2] == pytest.approx(path.table[0, :2], abs=1e-9)
+        # Round and round without a turn: where the ends meet the way goes on as everywhere.
+        goes = path.table[:-1, 2:]
+        assert (goes * np.roll(goes, 1, axis=0)).sum(axis=1).min() > 0.8
+
+
+@pytest.mark.parametrize("mode", ["default", "sampled"])
+def test_a_path_whose_ends_are_further_apart_is_open(mode):
+    assert not planned_table(ring(0.021, 0.05), mode).closed
