@@ -38,6 +38,9 @@ CORNER_RAD = math.radians(20.0)
 # much as being so much further off it.
 BRANCHES_M = 0.3
 AGAINST_BRANCH_M = 0.6
+# Chosen: laps this close, which go the same way within SAME_WAY_RAD, differ by less than poses and recorded laps do.
+SAME_PLACE_M = 0.1
+SAME_WAY_RAD = math.radians(45.0)
 
 
 class PathTable:
@@ -110,7 +113,8 @@ class PathTable:
         """Entry of the table nearest to a pose: near the one before, or anywhere without one or off the path.
 
         Near the one before means on the same piece; at the end of a piece the next one begins. Where several branches
-        pass by, the first place is on the one that the heading fits.
+        pass by, the first place is on the one that the heading fits; of laps over the same ground, it is on the first.
+        A robot that was off the path goes on with the lap that it was on.
         """
         count, spacing = len(self.table) - 1, self.spacing_m
         if before is not None:
@@ -129,10 +133,13 @@ class PathTable:
                 if self._bounds.size and (self.closed or last < count) and (last - found) * spacing <= REACHED_M:
                     found = last
                 return found % count if self.closed else found
-        return float(self._branch(x_m, y_m, yaw_rad))
+        return float(self._branch(x_m, y_m, yaw_rad, before or 0.0))
 
-    def _branch(self, x_m: float, y_m: float, yaw_rad: float) -> int:
-        """Entry where the branch is nearest whose distance and direction together fit a pose best."""
+    def _branch(self, x_m: float, y_m: float, yaw_rad: float, near: float) -> int:
+        """Entry where the branch is nearest whose distance and direction together fit a pose best.
+
+        Of laps over the same ground, the one whose entry is closest to `near`.
+        """
         distance = np.hypot(self.table[:, 0] - x_m, self.table[:, 1] - y_m)
         nearest = int(np.argmin(distance))
         if not (math.isfinite(yaw_rad) and math.isfinite(distance[nearest])):
@@ -145,7 +152,15 @@ class PathTable:
         branches = np.flatnonzero((distance <= before) & (distance < after))
         branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
         along = self.table[branches, 2] * math.cos(yaw_rad) + self.table[branches, 3] * math.sin(yaw_rad)
-        return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
+        best = branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))]
+        # Noise must not choose among laps.
+        apart = np.abs(branches - best)
+        apart = np.minimum(apart, len(self.table) - 1 - apart) if self.closed else apart
+        aside_x, aside_y = (self.table[branches, :2] - self.table[best, :2]).T
+        again = (apart * self.spacing_m > LOOK_BACK_M) & (np.hypot(aside_x, aside_y) < SAME_PLACE_M)
+        again &= self.table[branches, 2:] @ self.table[best, 2:] > math.cos(SAME_WAY_RAD)
+        laps = np.append(best, branches[again])
+        return int(laps[np.argmin(np.abs(laps - near))])
 
 
 def planned_table(points: Sequence[Point], mode: str) -> PathTable:
