@@ -350,7 +350,7 @@ class DaemonCore:
         follows = output.running and result.source in FOLLOWS
         return self._headway.step(
             now_ns, follows, place, (command.left_rad_s, command.right_rad_s), self.newest_wheels,
-            result.planner_failure,
+            result.planner_failure, self.progress.laps >= 1.0,
         )  # fmt: skip
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:
