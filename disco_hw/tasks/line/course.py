@@ -140,7 +140,9 @@ class PathProgress:
         return self._place is not None and (self._entries - self._place) * self._path.spacing_m <= END_M
 
     def describe(self) -> tuple[str, str]:
-        """Metres, and the part of the whole."""
+        """Laps of a closed path, or metres of an open one and the part of the whole."""
+        if self._path.closed:
+            return "laps", f"{self.laps:.2f}"
         return describe_part(self.laps, self._entries * self._path.spacing_m)
 
     def add(self, _now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:
