@@ -6,6 +6,7 @@ a pilot says: the task's planner, or somebody in its place.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -282,6 +283,9 @@ class DaemonCore:
         estimate = None if self.last is None else self.last.pipeline.estimate
         wheels = self.newest_wheels
         speed = 0.0 if wheels is None else max(abs(wheels.left_speed_rad_s), abs(wheels.right_speed_rad_s))
+        finished, off_end_m = self.progress.finished, 0.0
+        if finished and estimate is not None:
+            off_end_m = math.dist((estimate.x_m, estimate.y_m), self.course.outline_m()[-1])
         return Inputs(
             link_state=self.transport.state,
             link_generation=self.transport.generation,
@@ -292,7 +296,8 @@ class DaemonCore:
             wheel_speed_rad_s=speed,
             pose_ok=estimate is not None and estimate.pose_ok,
             preflight_errors=self._miswired or self._preflight_errors,
-            task_finished=self.progress.finished,
+            task_finished=finished,
+            off_end_m=off_end_m,
             requests=tuple(requests),
             recording_fault=self.recording_fault,
             heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
@@ -345,7 +350,7 @@ class DaemonCore:
         follows = output.running and result.source in FOLLOWS
         return self._headway.step(
             now_ns, follows, place, (command.left_rad_s, command.right_rad_s), self.newest_wheels,
-            result.planner_failure,
+            result.planner_failure, self.progress.laps >= 1.0,
         )  # fmt: skip
 
     def _state_change(self, now_ns: int, output: Output) -> list[records.Record]:

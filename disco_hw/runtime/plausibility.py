@@ -118,18 +118,22 @@ class _Window:
 
 
 class Headway:
-    """Watches a running task of this speed; one of NaN, whose places have times and may rest, is not watched."""
+    """Watches a running task of this speed; one of NaN, whose places have times and may rest, once these are over."""
 
     def __init__(self, speed_m_s: float) -> None:
-        self._least_m = min(LEAST_M, LEAST_WAY_PART * speed_m_s * WINDOW_NS * 1e-9) if speed_m_s > 0.0 else math.nan
+        self._may_rest = math.isnan(speed_m_s)
+        self._least_m = LEAST_M if self._may_rest else min(LEAST_M, LEAST_WAY_PART * speed_m_s * WINDOW_NS * 1e-9)
         self._window: _Window | None = None
 
     def step(
         self, now_ns: int, running: bool, place_m: tuple[float, float], command_rad_s: tuple[float, float],
-        wheels: WheelSample | None, planner_failure: str | None,
+        wheels: WheelSample | None, planner_failure: str | None, all_due: bool = False,
     ) -> tuple[str, ...]:  # fmt: skip
-        """Take in a tick; returns what to say, once for each time that the robot stays."""
-        if not running or math.isnan(self._least_m):
+        """Take in a tick; returns what to say, once for each time that the robot stays.
+
+        `all_due`: the robot should be at the task's end.
+        """
+        if not running or (self._may_rest and not all_due):
             self._window = None
             return ()
         angles = None if wheels is None else (wheels.left_angle_rad, wheels.right_angle_rad)

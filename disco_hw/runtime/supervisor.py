@@ -14,6 +14,8 @@ from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 
 FIND_HEADING = "the pose sensor measures none: drive one metre straight ahead by hand, on the page, to find it"
 AFTER_A_JUMP = "check that the robot is where the page shows it, then start again"
+# Chosen: nearer is what the plans of a drive without trouble leave.
+BESIDE_END_M = 0.1
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
 _ROBOT_HAS_FAULT = C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED
@@ -58,9 +60,9 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     `telemetry_age_s` is the age of the newest wheel sample, None before the first; `wheel_speed_rad_s` the larger
     magnitude of its two speeds. `link_error` is the link's newest error, with its remedy. `preflight_errors`
     are sentences for a person and hold for as long as they are given. `task_finished`: nothing of the task is left to
-    drive. `recording_fault`: why nothing is recorded although it should be, which keeps the robot from
-    being armed unless that is asked for. `heading_missing`: positions come, and which way the robot faces is not known;
-    `measures_no_heading`: because they have no heading.
+    drive, and the robot is `off_end_m` from its end. `recording_fault`: why nothing is recorded although it should be,
+    which keeps the robot from being armed unless that is asked for. `heading_missing`: positions come, and which way
+    the robot faces is not known; `measures_no_heading`: because they have no heading.
     `pose_refusal`: why poses that come are refused, in words, else empty.
     `by_hand`: a person drives, who sees that; nobody follows the task. `poses_contradict`: which two pose sources do,
     in words, else empty. `pose_jump`: how the estimate jumped in the tick before, in words, else empty. `fence_fault`:
@@ -78,6 +80,7 @@ class Inputs(msgspec.Struct, frozen=True, gc=False):
     preflight_errors: tuple[str, ...] = ()
     requests: tuple[UserRequest, ...] = ()
     task_finished: bool = False
+    off_end_m: float = 0.0
     recording_fault: str = ""
     heading_missing: bool = False
     measures_no_heading: bool = False
@@ -138,6 +141,7 @@ class Supervisor:
         self._running = False
         self._by_hand = False
         self._start_pending = False
+        self._just_started = False
         self._arming: _Pending | None = None
         self._resetting: _Pending | None = None
         self._estop_requested = False
@@ -322,6 +326,7 @@ class Supervisor:
 
     def _monitor_task(self, inputs: Inputs) -> None:
         """Start the task once armed, and stop it without a pose and at its end."""
+        just_started, self._just_started = self._just_started, False
         if self._state is not State.ARMED:
             return
         pose_fault = self._pose_fault(inputs)
@@ -330,7 +335,7 @@ class Supervisor:
         elif self._start_pending and pose_fault is not None:
             self._drop_pending(pose_fault)
         elif self._start_pending:
-            self._start_pending, self._running = False, True
+            self._start_pending, self._running, self._just_started = False, True, True
             self._events.append("task started")
         elif self._running and pose_fault is not None:
             self._running = False
@@ -345,7 +350,16 @@ class Supervisor:
             )
         elif self._running and inputs.task_finished:
             self._running = False
-            self._events.append("task stopped: the end of the path is reached")
+            beside = inputs.off_end_m > BESIDE_END_M
+            if just_started:
+                off = f", {inputs.off_end_m:.2f} m off" if beside else ""
+                self._events.append(
+                    f"task stopped: nothing was driven, as the nearest place of the path is its end{off}; put the "
+                    "robot at the first way-point and start again"
+                )
+            else:
+                off = f", {inputs.off_end_m:.2f} m beside it" if beside else ""
+                self._events.append(f"task stopped: the end of the path is reached{off}")
 
     def _fault_and_hint(self, hint: str) -> str:
         """Return the trouble with its own remedy if it names one, else with this one.

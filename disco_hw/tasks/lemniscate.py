@@ -26,7 +26,7 @@ from disco_hw.tasks import (
     too_fast,
     too_small,
 )
-from disco_hw.tasks.line import PathTable, planned_table
+from disco_hw.tasks.line import planned_table
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import LineCourse, PathProgress, line_course
 
@@ -114,7 +114,7 @@ class LemniscateTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
     def progress(self) -> PathProgress:
         """Laps of both lobes."""
-        return PathProgress(PathTable(np.array(self.points())))
+        return PathProgress(planned_table(self.points(), "default"))
 
     def planned(self, mode: str) -> PathCost:
         """Return the cost of following the figure, for the planner; its line is finer in the default mode."""

@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
 import msgspec
-import numpy as np
 from msgspec import Meta
 
 from disco_hw.errors import FieldFault, InputError
 from disco_hw.tasks import Chassis, Editable, Point, Positive, straight_fastest_m_s
-from disco_hw.tasks.line import PathTable, check_size, load_waypoints, planned_table, points_of
+from disco_hw.tasks.line import check_size, load_waypoints, planned_table, points_of
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.line.course import (
     LineCourse,
@@ -95,7 +94,7 @@ class PathTask(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     def progress(self) -> PathProgress:
         """Laps of a closed path, or the part of an open one that is behind."""
-        return PathProgress(PathTable(np.array(self.points)))
+        return PathProgress(planned_table(self.points, "default"))
 
     def planned(self, mode: str) -> PathCost:
         """Return the cost of following the path, for the planner; its line is finer in the default mode."""

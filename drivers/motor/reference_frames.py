@@ -23,10 +23,11 @@ from drivers.types import (
 from firmware_protocol.codec import PROTOCOL, Codec, Decoded, DecodeFault, FaultReason
 from firmware_protocol.protection import COUNTER_MODULUS, E2EReceiver, E2EStatus, EncodedFrame, Prover
 
-# Five periods of the slowest cyclic messages: 0.1 s of most, 1 s of LINK_HEALTH; a few lost frames lose no sender.
+# Five periods of the slowest cyclic messages: 0.1 s of most, 1 s of LINK_HEALTH; a few lost frames lose no sender. The
+# poses' period is the sensor's; old ones are refused by their age.
 TIMEOUT_NS = 500_000_000
 SLOW_TIMEOUT_NS = 5_000_000_000
-_SLOW = frozenset({"POWER", "LINK_HEALTH"})
+_SLOW = frozenset({"POWER", "LINK_HEALTH", "POSE_POSITION", "POSE_HEADING"})
 # Asked for one by one, so that there is no row of good frames to wait for; hearing one twice does no harm.
 _ANSWERS = frozenset({"HELLO", "BUILD", "LIMITS", "TIME_RESPONSE", "PARAM_RESPONSE", "MAC_CHALLENGE"})
 _SENDERS = {layout.name: layout.sender for layout in PROTOCOL.messages}

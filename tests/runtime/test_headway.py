@@ -9,6 +9,8 @@ from disco_hw.runtime import State
 from disco_hw.runtime.plausibility import Headway
 from disco_hw.runtime.robot_setup import load_setup
 from drivers.types import WheelSample
+from sim.body_dynamics import BodyPose
+from tests.runtime.path_robot import timed_path_robot
 from tests.runtime.simulated import ROBOT_FILE, simulated_stack, start
 
 TICK_NS = 20_000_000
@@ -61,6 +63,28 @@ def test_it_is_reported_when_the_robot_gets_on_again():
         x_m = 0.0 if tick < 300 else 0.004 * (tick - 300)
         found += headway.step(tick * TICK_NS, True, (x_m, 0.0), COMMAND, None, None)
     assert [text.split(":")[1] for text in found] == [" no progress for 5 s", " the robot makes progress again"]
+
+
+def test_way_points_by_time_are_watched_once_the_last_time_is_over():
+    headway, found = Headway(math.nan), []
+    for tick in range(1000):
+        now_ns, is_over = tick * TICK_NS, tick >= 500
+        found += [
+            (now_ns * 1e-9, text) for text in headway.step(now_ns, True, (0.0, 0.0), (0.0, 0.0), None, None, is_over)
+        ]
+    ((at_s, text),) = found
+    assert at_s == pytest.approx(15.0, abs=0.05)
+    assert "no progress for 5 s" in text
+
+
+def test_the_daemon_says_that_a_robot_stands_short_of_the_end_of_way_points_by_time(tmp_path):
+    robot_file = timed_path_robot(tmp_path, "t_s,x_m,y_m\n0,0,0\n2,0.3,0\n")
+    setup = load_setup(robot_file)
+    law = LawController(lambda *_: (0.0, 0.0), setup.model, setup.config.task.planned(setup.config.control.mode))
+    stack = simulated_stack(robot_file=robot_file, planner=law, start=BodyPose(0.23, 0.0, 0.0))
+    start(stack, 0.02)
+    events = [event for tick in stack.run(7.5) for event in tick.events]
+    assert [event.split(":")[1] for event in events if event.startswith("task:")] == [" no progress for 5 s"]
 
 
 def started(**changes):

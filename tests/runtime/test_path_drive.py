@@ -99,6 +99,16 @@ def test_an_open_path_ends_with_the_robot_standing_and_is_replayed_and_shown_wit
     assert (tmp_path / "end.png").stat().st_size > 10_000
 
 
+def test_a_start_beyond_the_end_of_a_path_is_reported_as_no_drive(tmp_path):
+    stack = simulated_stack(robot_file=path_robot(tmp_path, CORNER), start=BodyPose(1.0, 2.5, 1.57))
+    start(stack, 0.02)
+    stack.run(0.1)
+    assert not stack.core.last.output.running
+    texts = [event.text for event in recorded(stack, Event) if event.text.startswith("task stopped")]
+    assert len(texts) == 1
+    assert "its end, 2.0" in texts[0]
+
+
 @pytest.mark.thorough
 def test_another_speed_is_recorded_and_replayed(tmp_path):
     robot_file = path_robot(tmp_path, CORNER)

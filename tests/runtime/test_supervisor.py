@@ -435,3 +435,28 @@ def test_what_would_not_be_recorded_is_armed_only_if_that_is_asked_for_and_not_s
 )
 def test_to_arm_unrecorded_needs_all_else_that_arming_needs(start, changes):
     assert not bench_in(start).tick(UserRequest.ARM_UNRECORDED, **changes).replies[0].accepted
+
+
+@pytest.mark.parametrize(
+    ("off_end_m", "event"),
+    [
+        (0.07, "task stopped: the end of the path is reached"),
+        (3.0, "task stopped: the end of the path is reached, 3.00 m beside it"),
+    ],
+)
+def test_a_task_that_ends_beside_its_end_says_how_far(off_end_m, event):
+    bench = Bench().ready()
+    bench.tick(ARM, START, count=10)
+    assert bench.out.running
+    out = bench.tick(task_finished=True, off_end_m=off_end_m)
+    assert (out.running, out.events[-1]) == (False, event)
+
+
+@pytest.mark.parametrize(("off_end_m", "where"), [(0.07, "its end;"), (3.0, "its end, 3.00 m off;")])
+def test_a_task_that_is_over_as_it_starts_is_no_success(off_end_m, where):
+    bench = Bench().ready()
+    bench.tick(ARM, count=10)
+    bench.tick(START)
+    (event,) = bench.tick(task_finished=True, off_end_m=off_end_m).events
+    assert event.startswith(f"task stopped: nothing was driven, as the nearest place of the path is {where}")
+    assert "first way-point" in event

@@ -27,6 +27,18 @@ def test_a_closed_path_that_crosses_itself_counts_laps_on_and_back():
     assert not progress.finished
 
 
+def test_a_closed_path_tells_its_laps_as_a_circle_does_and_an_open_one_its_metres():
+    progress = CLOSED.progress()
+    for a in np.linspace(0.0, 4.5 * np.pi, 500):
+        progress.add(0, 1.5 * math.sin(a), 0.75 * math.sin(2.0 * a), math.nan)
+    name, text = progress.describe()
+    assert name == "laps"
+    assert float(text) == pytest.approx(2.25, abs=0.06)
+    line = LINE.progress()
+    line.add(0, 0.5, 0.0, math.nan)
+    assert line.describe() == ("progress", "0.50 of 2.00 m (25%)")
+
+
 def test_an_open_path_has_an_end():
     progress = LINE.progress()
     assert (progress.laps, progress.finished) == (0.0, False)

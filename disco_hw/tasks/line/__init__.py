@@ -23,6 +23,8 @@ SPACING_M = 0.02
 REFINED_SPACING_M = 0.01
 # Entries closer than this part of the spacing lie on either side of a turn straight back.
 FOLDED = 0.01
+# Chosen: ends this close are meant to meet, as where the file rounds or somebody recorded a lap by hand.
+CLOSED_M = 0.02
 LOOK_BACK_M = 0.3
 LOOK_AHEAD_M = 1.0
 LOST_M = 1.0
@@ -36,18 +38,27 @@ CORNER_RAD = math.radians(20.0)
 # much as being so much further off it.
 BRANCHES_M = 0.3
 AGAINST_BRANCH_M = 0.6
+# Chosen: laps this close, which go the same way within SAME_WAY_RAD, differ by less than poses and recorded laps do.
+SAME_PLACE_M = 0.1
+SAME_WAY_RAD = math.radians(45.0)
 
 
 class PathTable:
     """Way-points (N, 2) in equal pieces of arc length, of about `nominal_spacing_m`; immutable.
 
     Where the way turns sharply it is cut into pieces: the robot stops at a piece's end and turns to the next. The path
-    is `closed` if its last way-point is its first. `table`: x, y (m) of each entry, and the unit tangent of the piece
-    that begins there; `spacing_m`: arc length between two entries. Raises ValueError for way-points closer than the
-    table's spacing throughout.
+    is `closed` if its last way-point is within CLOSED_M of its first, and then ends there. `table`: x, y (m) of each
+    entry, and the unit tangent of the piece that begins there; `spacing_m`: arc length between two entries. Raises
+    ValueError for way-points closer than the table's spacing throughout.
     """
 
     def __init__(self, places_m: Array, nominal_spacing_m: float = SPACING_M) -> None:
+        from_first_m = np.hypot(*(places_m - places_m[0]).T)
+        self.closed = closed = bool(from_first_m[-1] < CLOSED_M)
+        if closed and from_first_m[-1] > 0.0 and from_first_m.max() >= CLOSED_M:
+            # Without those about the first, which may lie beyond it: the way would turn back to it.
+            last = int(np.flatnonzero(from_first_m >= CLOSED_M)[-1])
+            places_m = np.vstack([places_m[: last + 1], places_m[:1]])
         distance = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(places_m, axis=0).T))])
         count = round(distance[-1] / nominal_spacing_m)
         if count < 1:
@@ -59,7 +70,6 @@ class PathTable:
         (folds,) = np.nonzero(np.hypot(np.diff(x), np.diff(y)) < FOLDED * distance[-1] / count)
         turns = np.searchsorted(distance, at[folds], side="right")
         x[folds], y[folds] = places_m[turns].T
-        self.closed = closed = bool(np.hypot(*(places_m[0] - places_m[-1])) < nominal_spacing_m)
         self.spacing_m: float = float(distance[-1]) / count
         corners = sharp_turns(np.column_stack([x, y]), closed, max(1, round(TURN_M / self.spacing_m)))
         x, y = _rounded(np.column_stack([x, y]), closed).T
@@ -103,7 +113,8 @@ class PathTable:
         """Entry of the table nearest to a pose: near the one before, or anywhere without one or off the path.
 
         Near the one before means on the same piece; at the end of a piece the next one begins. Where several branches
-        pass by, the first place is on the one that the heading fits.
+        pass by, the first place is on the one that the heading fits; of laps over the same ground, it is on the first.
+        A robot that was off the path goes on with the lap that it was on.
         """
         count, spacing = len(self.table) - 1, self.spacing_m
         if before is not None:
@@ -122,10 +133,13 @@ class PathTable:
                 if self._bounds.size and (self.closed or last < count) and (last - found) * spacing <= REACHED_M:
                     found = last
                 return found % count if self.closed else found
-        return float(self._branch(x_m, y_m, yaw_rad))
+        return float(self._branch(x_m, y_m, yaw_rad, before or 0.0))
 
-    def _branch(self, x_m: float, y_m: float, yaw_rad: float) -> int:
-        """Entry where the branch is nearest whose distance and direction together fit a pose best."""
+    def _branch(self, x_m: float, y_m: float, yaw_rad: float, near: float) -> int:
+        """Entry where the branch is nearest whose distance and direction together fit a pose best.
+
+        Of laps over the same ground, the one whose entry is closest to `near`.
+        """
         distance = np.hypot(self.table[:, 0] - x_m, self.table[:, 1] - y_m)
         nearest = int(np.argmin(distance))
         if not (math.isfinite(yaw_rad) and math.isfinite(distance[nearest])):
@@ -138,7 +152,15 @@ class PathTable:
         branches = np.flatnonzero((distance <= before) & (distance < after))
         branches = np.append(nearest, branches[distance[branches] < distance[nearest] + BRANCHES_M])
         along = self.table[branches, 2] * math.cos(yaw_rad) + self.table[branches, 3] * math.sin(yaw_rad)
-        return int(branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))])
+        best = branches[np.argmin(distance[branches] + 0.5 * AGAINST_BRANCH_M * (1.0 - along))]
+        # Noise must not choose among laps.
+        apart = np.abs(branches - best)
+        apart = np.minimum(apart, len(self.table) - 1 - apart) if self.closed else apart
+        aside_x, aside_y = (self.table[branches, :2] - self.table[best, :2]).T
+        again = (apart * self.spacing_m > LOOK_BACK_M) & (np.hypot(aside_x, aside_y) < SAME_PLACE_M)
+        again &= self.table[branches, 2:] @ self.table[best, 2:] > math.cos(SAME_WAY_RAD)
+        laps = np.append(best, branches[again])
+        return int(laps[np.argmin(np.abs(laps - near))])
 
 
 def planned_table(points: Sequence[Point], mode: str) -> PathTable:

@@ -128,17 +128,21 @@ class PathProgress:
         """Laps of a closed path since the task started, or the part of an open one that is behind, 0 to 1."""
         if self._path.closed:
             return self._moved / self._entries
-        return (self._place or 0.0) / self._entries
+        return 1.0 if self._at_end else (self._place or 0.0) / self._entries
 
     @property
     def finished(self) -> bool:
         """Whether the end of an open path is reached."""
-        if self._path.closed or self._place is None or self._paused:
-            return False
-        return (self._entries - self._place) * self._path.spacing_m <= END_M
+        return self._at_end and not self._path.closed and not self._paused
+
+    @property
+    def _at_end(self) -> bool:
+        return self._place is not None and (self._entries - self._place) * self._path.spacing_m <= END_M
 
     def describe(self) -> tuple[str, str]:
-        """Metres, and the part of the whole."""
+        """Laps of a closed path, or metres of an open one and the part of the whole."""
+        if self._path.closed:
+            return "laps", f"{self.laps:.2f}"
         return describe_part(self.laps, self._entries * self._path.spacing_m)
 
     def add(self, _now_ns: int, x_m: float, y_m: float, yaw_rad: float) -> None:

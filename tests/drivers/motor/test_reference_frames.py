@@ -122,6 +122,15 @@ def test_slow_messages_may_be_silent_for_longer():
     assert [reception.accept(frame) is not None for frame in frames] == [False, False, False, True]
 
 
+def test_poses_may_come_at_one_a_second():
+    reception = FrameReception(CODEC)
+    values = {"yaw": 0.5, "position_std": 0.02, "yaw_std": 0.02, "sample_time": 0.0, "valid": 1}
+    poses = {"POSE_POSITION": {"x": 1.0, "y": 2.0, "valid": 1}, "POSE_HEADING": values}
+    for name, signals in poses.items():
+        frames = [received(name, n, n * 1000 * MS, **signals) for n in range(5)]
+        assert [reception.accept(frame) is not None for frame in frames] == [False, False, False, True, True]
+
+
 @examples(
     quick=40,
     every=100,

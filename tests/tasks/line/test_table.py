@@ -7,6 +7,7 @@ import pytest
 
 from disco_hw.tasks.lemniscate import LemniscateTask
 from disco_hw.tasks.line import PathTable, planned_table
+from disco_hw.tasks.path import PathTask
 
 ANGLE = np.linspace(0.0, 2.0 * np.pi, 400)
 EIGHT = PathTable(np.column_stack([1.5 * np.sin(ANGLE), 0.75 * np.sin(2.0 * ANGLE)]))
@@ -70,3 +71,66 @@ def test_refined_plans_follow_a_finer_table(length_m, mode, spacing_m):
     assert table.spacing_m == pytest.approx(spacing_m, rel=1e-3)
     corner = np.hypot(*(table.table[:, :2] - (side_m, 0.0)).T).min()
     assert corner <= 0.5 * spacing_m
+
+
+def ring(gap_m, way_m):
+    """A circle of 0.6 m whose last way-point is so far before the first, with so much between way-points."""
+    angle = np.linspace(0.0, 2.0 * np.pi - gap_m / 0.6, round(3.8 / way_m))
+    return tuple(zip(0.6 * np.sin(angle), 0.6 - 0.6 * np.cos(angle), strict=True))
+
+
+@pytest.mark.parametrize("way_m", [0.05, 0.004])
+@pytest.mark.parametrize("gap_m", [0.0, 0.011, 0.015, 0.019, -0.015])
+def test_a_path_is_closed_whatever_its_table_if_its_ends_are_within_2_cm(gap_m, way_m):
+    for mode in ("default", "sampled"):
+        path = planned_table(ring(gap_m, way_m), mode)
+        assert path.closed
+        assert path.table[-1, :2] == pytest.approx(path.table[0, :2], abs=1e-9)
+        # Round and round without a turn: where the ends meet the way goes on as everywhere.
+        goes = path.table[:-1, 2:]
+        assert (goes * np.roll(goes, 1, axis=0)).sum(axis=1).min() > 0.8
+
+
+@pytest.mark.parametrize("mode", ["default", "sampled"])
+def test_a_path_whose_ends_are_further_apart_is_open(mode):
+    assert not planned_table(ring(0.021, 0.05), mode).closed
+
+
+def laps_of(radius_m):
+    """Three laps and a piece, all over the same ground, in one file."""
+    angle = np.linspace(0.0, 6.0 * math.pi + 0.8, 250)
+    return tuple(zip(radius_m * np.sin(angle), radius_m - radius_m * np.cos(angle), strict=True))
+
+
+LAPS = laps_of(0.6)
+
+
+@pytest.mark.parametrize("mode", ["default", "sampled"])
+def test_of_laps_over_the_same_ground_the_first_is_begun(mode):
+    path = planned_table(LAPS, mode)
+    lap_m, rng = 1.2 * math.pi, np.random.default_rng(3)
+    # At the first way-point, on the way of the last 0.5 m, and half round.
+    for begun_m in (0.0, 0.4, 0.5 * lap_m):
+        for _ in range(100):
+            x, y = 0.6 * math.sin(begun_m / 0.6), 0.6 - 0.6 * math.cos(begun_m / 0.6)
+            place = path.place(
+                x + rng.normal(0.0, 0.01), y + rng.normal(0.0, 0.01), begun_m / 0.6 + rng.normal(0.0, 0.1), None
+            )
+            assert place * path.spacing_m == pytest.approx(begun_m, abs=0.1)
+
+
+def test_a_robot_that_was_off_the_path_goes_on_with_the_lap_that_it_was_on():
+    path = planned_table(laps_of(1.5), "default")
+    lap = 3.0 * math.pi / path.spacing_m
+    assert path.place(0.0, 0.0, 0.0, 1.6 * lap) == pytest.approx(2.0 * lap, abs=10.0)
+    assert path.place(0.0, 0.0, 0.0, 2.6 * lap) == pytest.approx(3.0 * lap, abs=10.0)
+
+
+def test_planner_and_progress_begin_at_the_same_place():
+    task, rng = PathTask(path="laps.csv", points=LAPS), np.random.default_rng(4)
+    path = task.planned("default").path
+    for _ in range(50):
+        x_m, y_m, yaw_rad = rng.normal(0.0, (0.1, 0.1, 0.3))
+        progress = task.progress()
+        progress.add(0, x_m, y_m, yaw_rad)
+        assert progress.laps == path.place(x_m, y_m, yaw_rad, None) / (len(path.table) - 1)
