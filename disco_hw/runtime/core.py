@@ -185,7 +185,7 @@ class DaemonCore:
             *fence_events,
             *self._stays(now_ns, output, result),
         )
-        self._follow_progress(output, result)
+        self._follow_progress(output, result, motion)
         self.recorder.put(
             now_ns,
             [
@@ -368,8 +368,9 @@ class DaemonCore:
         changed, self._task_changed = self._task_changed, False
         return [record_of(now_ns, self.task)] if changed else []
 
-    def _follow_progress(self, output: Output, result: Tick) -> None:
-        if output.running and not self._jump:
+    def _follow_progress(self, output: Output, result: Tick, motion: Motion) -> None:
+        """Follow the task's progress while it is the task that drives, and no pilot in its place."""
+        if output.running and not self._jump and isinstance(motion, FollowTask):
             pose = result.estimate
             # A path that crosses itself is begun on the branch that the robot drives along.
             self.progress.add(result.t_ns, pose.x_m, pose.y_m, pose.yaw_rad + self.config.turned_rad)

@@ -12,7 +12,9 @@ from disco_hw.runtime.core import PilotTick, TaskPilot
 from disco_hw.runtime.pipeline import FollowTask, Manual, NoPlanner, Source
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
+from sim.body_dynamics import BodyPose
 from tests.runtime import simulated
+from tests.runtime.path_robot import path_robot
 from tests.runtime.simulated import arm, simulated_stack
 
 
@@ -49,6 +51,15 @@ def test_what_a_pilot_wants_counts_only_where_the_supervisor_allows_motion():
     assert running[-1].command.left_rad_s == 3.0
     # Replies to others are none of the pilot's.
     assert stack.pilot.replies == ()
+
+
+def test_a_pilot_that_drives_past_the_end_of_a_path_is_not_stopped_there(tmp_path):
+    stack = simulated_stack(robot_file=path_robot(tmp_path, "x_m,y_m\n0,0\n1,0\n"), start=BodyPose(0.9, 0.0, 0.0))
+    stack.pilot = Eager()
+    stack.run(1.5)
+    stack.run(0.5, UserRequest.ARM)
+    assert stack.run(1.0, UserRequest.START)[-1].output.running
+    assert stack.robot.truth.x_m > 1.0
 
 
 @pytest.mark.parametrize("needs_pose", [True, False])
