@@ -48,6 +48,8 @@ _SECOND_NS = 1_000_000_000
 _WAIT_S = 0.05
 # Chosen: a flood on one topic must not hold up the others.
 _MAX_BATCH = 20
+# Chosen: what a publisher sent before it was found arrives one by one, without such a pause.
+_HISTORY_NS = 100_000_000
 
 _ACKNOWLEDGED = Policy.Reliability.Reliable(duration(milliseconds=5))
 SENSOR = Qos(Policy.Reliability.BestEffort, Policy.Durability.Volatile, Policy.History.KeepLast(5))
@@ -119,6 +121,8 @@ class Bridge:
         self._to_daemon.setblocking(False)
         self._unsent = self._obstacles_unsent = self._unwritten = 0
         self._unread = UnreadCounts()
+        self._latched_estops: dict[str | None, tuple[msg.Bool, int, int]] = {}
+        """Newest latched message of each publisher, and when it was sent and received."""
         self._received_ns = self._next_diagnosis_ns = 0
         self._failure: BaseException | None = None
         self._ended = threading.Event()
@@ -194,9 +198,10 @@ class Bridge:
             yield self._reader(namespace, ros2_obstacles.TOPIC, obstacles, SENSOR), self._handle_obstacles
         yield self._reader(namespace, CTL, msg.String, RELIABLE, SENSOR), self._handle_request
         # Each by itself: an e-stop that counts twice does no harm, and it must not wait for what was lost before it.
-        # Latched, too: one that was pressed before this process began is in force, unlike a request of then.
-        for qos in (LATCHED, RELIABLE, SENSOR):
+        for qos in (RELIABLE, SENSOR):
             yield self._reader(namespace, ESTOP, msg.Bool, qos), self._handle_estop
+        # Latched, too: one that was pressed before this process began is in force, unlike a request of then.
+        yield self._reader(namespace, ESTOP, msg.Bool, LATCHED), self._keep_latched_estop
 
     def _reader(self, namespace: str, topic: str, kind: Any, *qualities: Qos) -> TopicReaders:
         return TopicReaders(self._participant, Topic(self._participant, wire_name(topic, namespace), kind), qualities)
@@ -212,6 +217,7 @@ class Bridge:
                 for readers, handle in self._readers:
                     for message, sent_ns in readers.take(_MAX_BATCH, self._unread):
                         handle(message, sent_ns)
+                self._handle_latched_estops()
         except BaseException as failure:
             self._failure = failure
 
@@ -263,6 +269,17 @@ class Bridge:
     def _handle_estop(self, message: msg.Bool, sent_ns: int) -> None:
         if message.data:
             self._stopping.add(partial(self._reply_to, sent_ns), "estop")
+
+    def _keep_latched_estop(self, message: msg.Bool, sent_ns: int) -> None:
+        self._latched_estops[_publisher_of(message)] = message, sent_ns, time.monotonic_ns()
+
+    def _handle_latched_estops(self) -> None:
+        """Handle the newest latched e-stop of each publisher: one that was released before is in force no more."""
+        now_ns = time.monotonic_ns()
+        for publisher, (message, sent_ns, received_ns) in list(self._latched_estops.items()):
+            if now_ns - received_ns > _HISTORY_NS:
+                del self._latched_estops[publisher]
+                self._handle_estop(message, sent_ns)
 
     def _reply_to(self, sent_ns: int, request: str) -> None:
         """Carry out a request and publish the reply; where the daemon is driven by hand, arming only permits speeds."""

@@ -42,6 +42,8 @@ class ObstacleInlet:
         self._frame = frame.lstrip("/")
         self._unnamed: dict[tuple[int, int], tuple[Hashable, int]] = {}
         """Publisher and time of the last report of each numbered obstacle, by its id and number."""
+        self._first_ns: dict[Hashable, int] = {}
+        """When each publisher's first whole array came."""
 
     def datagrams(
         self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int, wall_ns: int, publisher: Hashable = None
@@ -49,7 +51,8 @@ class ObstacleInlet:
         """Return the datagrams to send for a message received now, one for each obstacle and each that is gone.
 
         `sent_ns`, `wall_ns`: when it was sent and received, by the wall clock. The first counts where the message has
-        no stamp. `publisher`: who sent it; no other says that its numbered obstacles are gone.
+        no stamp. `publisher`: who sent it; no other says that its numbered obstacles are gone, but
+        one that came when it was silent: a sender that restarts is another publisher.
         """
         gone: Sequence[ObstacleReport] = ()
         if isinstance(message, msg.String):
@@ -104,6 +107,10 @@ class ObstacleInlet:
         # An empty array is of its header's frame and time.
         if any(self._age_of(one, message, sent_ns, wall_ns)[1] for one in message.obstacles or [msg.ObstacleMsg()]):
             return []
+        first_ns = self._first_ns.setdefault(publisher, wall_ns)
+        for key, (_, reported_ns) in self._unnamed.items():
+            if reported_ns < first_ns and wall_ns - reported_ns > _OLDEST_NS:
+                self._unnamed[key] = (publisher, wall_ns)
         counts = Counter(one.id for one in message.obstacles)
         gone = [key for key, (sender, _) in self._unnamed.items() if sender == publisher and key[1] > counts[key[0]]]
         for key in gone:
@@ -111,6 +118,8 @@ class ObstacleInlet:
                 del self._unnamed[key]
         if len(self._unnamed) > _MOST_UNNAMED:
             self._unnamed.clear()
+        if len(self._first_ns) > _MOST_UNNAMED:
+            self._first_ns.clear()
         for number, count in counts.items():
             if number <= 0 or count > 1 or (number, 1) in self._unnamed:
                 reported = range(1, min(count, MOST_OBSTACLES) + 1)

@@ -137,10 +137,12 @@ class PoseSources:
                 one.reset_course()
         source.add_evaluation(update.reason, update.innovation, update.innovation_variance)
         text = _describe_refusal(sample, update, self._history_s)
-        source.refusal = text and f"{source.label}: {text}"
-        if source.refusal and update.reason not in source.reported:
+        refusal = text and f"{source.label}: {text}"
+        # One too many says nothing about those that are used.
+        source.refusal = "" if update.reason is PoseReason.OVERFLOW else refusal
+        if refusal and update.reason not in source.reported:
             source.reported.add(update.reason)
-            self._messages.append(source.refusal)
+            self._messages.append(refusal)
         if update.accepted:
             source.good_ns = max(sample.t_ns, source.good_ns or sample.t_ns)
 
@@ -162,10 +164,13 @@ class PoseSources:
         messages, self._messages = self._messages, []
         return messages
 
-    @property
-    def refusal(self) -> str:
-        """Why the newest pose of a source was refused, in words; empty if none was, or for no reason that lasts."""
-        return next((one.refusal for one in self.all if one.refusal), "")
+    def refusal(self, now_ns: int) -> str:
+        """Why the newest pose of a source was refused, in words; empty if none was, or for no reason that lasts.
+
+        A source that is silent is left out: that is then why there is no pose.
+        """
+        came = (one for one in self.all if one.came_ns is not None and now_ns - one.came_ns <= self._timeout_ns)
+        return next((one.refusal for one in came if one.refusal), "")
 
     def is_good(self, number: int) -> bool:
         """Whether poses of this source are believed; of a single one they always are."""

@@ -302,7 +302,7 @@ class DaemonCore:
             recording_fault=self.recording_fault,
             heading_missing=estimate is not None and estimate.initialised and not estimate.heading_known,
             measures_no_heading=self.pipeline.headings.measures_none,
-            pose_refusal=self.pipeline.fusion.sources.refusal,
+            pose_refusal=self.pipeline.fusion.sources.refusal(now_ns),
             by_hand=by_hand,
             poses_contradict=self.pipeline.fusion.sources.contradiction,
             pose_jump=self._jump,

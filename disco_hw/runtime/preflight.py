@@ -9,7 +9,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from disco_hw.config import Control, Link, Robot, RobotConfig
+from disco_hw.errors import FieldFault
 from disco_hw.fence import Fence
+from disco_hw.tasks import RobotTask, straight_fastest_m_s
 from drivers.motor import find_driver
 from drivers.types import SOURCE_TEXTS, CyclicFrame, Limits, SafetyCard
 from firmware_protocol.serial_framing import BITS_PER_BYTE
@@ -131,15 +133,37 @@ def check_firmware_limits(robot: Robot, limits: Limits) -> list[Check]:
     return [Check("firmware limits", Level.OK, "; ".join(found))]
 
 
+def _fastest_m_s(config: RobotConfig, task: RobotTask) -> float:
+    """Return the speed at which a wheel, or in the tightest bend the turning of the base, is at its limit."""
+    robot, fastest_m_s = config.robot, task.fastest_m_s(config.robot)
+    # Twice what the outer wheel of the tightest bend turns more than straight ahead: the difference of both wheels.
+    difference_part = 2.0 * (straight_fastest_m_s(robot) / fastest_m_s - 1.0)
+    if difference_part <= 0.0:
+        return fastest_m_s
+    return min(fastest_m_s, config.largest_wheel_difference_rad_s * robot.wheel_radius_m / difference_part)
+
+
+def beyond_robot(config: RobotConfig, task: RobotTask) -> FieldFault | None:
+    """Return what of the task the nominal robot and its base cannot do; None if they can."""
+    fault, fastest_m_s = task.beyond_robot(config.robot), _fastest_m_s(config, task)
+    if fault is not None or not task.reference_speed_m_s > fastest_m_s:
+        return fault
+    return FieldFault(
+        "speed_m_s",
+        f"{task.reference_speed_m_s:g} m/s turns the robot faster than its base can",
+        f"write at most {math.floor(fastest_m_s * 1000.0) / 1000.0:g} m/s, or a larger figure",
+    )
+
+
 def check_task(config: RobotConfig) -> Check:
     """Compare the task with what the nominal robot can do; `config` is that of `config_for_tasks`."""
-    robot, task = config.robot, config.task
-    fault = task.beyond_robot(robot)
+    task = config.task
+    fault = beyond_robot(config, task)
     if fault is not None:
         return Check("task", Level.FAIL, f"task.{fault.field}: {fault.fault}; {fault.hint}")
     backwards = ", driven backwards" if config.turned_rad else ""
     return Check(
-        "task", Level.OK, f"{task.describe()}{backwards}; the wheels can do {task.fastest_m_s(robot):.2f} m/s on it"
+        "task", Level.OK, f"{task.describe()}{backwards}; the wheels can do {_fastest_m_s(config, task):.2f} m/s on it"
     )
 
 

@@ -34,6 +34,7 @@ from disco_hw.files import ROBOT_TOML as ROBOT_KIND
 from disco_hw.log import MODEL_TOML, PATH_CSV, ROBOT_TOML, Attachment, TaskScene, attachment, records
 from disco_hw.model import Model, load_model
 from disco_hw.runtime import IN_USE, State
+from disco_hw.runtime.preflight import beyond_robot
 from disco_hw.tasks import RobotTask, kind_of, task_from
 from drivers.private_files import KeyFileError, key_of_file
 
@@ -211,7 +212,7 @@ def changed_task(task: RobotTask, requested: Mapping[str, Any], config: RobotCon
         # What the wheels can do depends on the other fields too, and is judged below.
         values[name] = _number(name, value, low, _FASTEST_M_S if name == "speed_m_s" else high)
     changed = with_values(task, values)
-    fault = changed.beyond_robot(config.robot) or task_fault(config, changed)
+    fault = beyond_robot(config, changed) or task_fault(config, changed)
     if fault is not None:
         raise TaskRefused(f"{fault.field}: {fault.fault}; {fault.hint}")
     return changed

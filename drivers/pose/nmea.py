@@ -132,11 +132,9 @@ _LEAST_STD_M = 0.005
 _HINT_NS = 10_000_000_000
 # Chosen: GST may come less often than GGA; two of it may be missed at 1 Hz.
 _GST_HOLDS_S = 2.5
-# docs/poses.md: a position waits so long for its heading, but half the time to the next position at most, or the next
-# heading would be taken for its own; longer than an epoch's sentences take on the line.
+# docs/poses.md: position and heading, whichever comes first, wait so long for the other, but half the time to the next
+# position at most, or that of another epoch would be taken for it; longer than an epoch's sentences take on the line.
 _PAIR_NS = 60_000_000
-# docs/poses.md: a heading that came first waits so long for its position; an older one is of the epoch before.
-_HEADING_FIRST_NS = 20_000_000
 # Chosen: a receiver that sent no heading for so long no longer makes positions wait for one.
 _HEADING_HOLDS_NS = 2_000_000_000
 # Chosen: longer finds a smaller delay, shorter follows a drifting clock sooner.
@@ -227,7 +225,7 @@ class Fixes:
     """Conversion of NMEA sentences into poses: `add_line` each with its arrival, `flush` now and then; pure.
 
     What they give is a datagram's map (`drivers.pose.udp`), or {"said": sentence} where something changed for the worse
-    or the better. A heading belongs to one position: that which waits for it, or else the next one within 20 ms.
+    or the better. A heading belongs to one position: that which waits for it, or else the next one, if it comes soon.
     """
 
     datum: tuple[float, float] | None = None
@@ -329,7 +327,7 @@ class Fixes:
         notes += self._end_wait()
         self._waits_for_ns = self._longest_wait_ns(time_s)
         heading, self._unused_heading = self._unused_heading, None
-        if heading is not None and arrival_ns - heading.arrival_ns < _HEADING_FIRST_NS:
+        if heading is not None and arrival_ns - heading.arrival_ns < self._waits_for_ns:
             return [*notes, self._with_heading(position, heading)]
         if self._heading is None or arrival_ns - self._heading.arrival_ns > _HEADING_HOLDS_NS:
             return [*notes, position]
@@ -337,7 +335,7 @@ class Fixes:
         return notes
 
     def _longest_wait_ns(self, time_s: float) -> int:
-        """Return how long this position waits for its heading."""
+        """Return how far apart this position and its heading may come."""
         before_s, self._position_time_s = self._position_time_s, time_s
         epoch_s = 0.0 if before_s is None else abs(math.remainder(time_s - before_s, DAY_S))
         return min(_PAIR_NS, round(0.5e9 * epoch_s) or _PAIR_NS)

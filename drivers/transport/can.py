@@ -355,7 +355,10 @@ def require_server(host: str, port: int) -> None:
         try:
             probe.recv(64)
         except TimeoutError:
-            raise LinkLostError("the server sends no greeting; restart it, or correct host and port") from None
+            raise LinkLostError(
+                "the server sends no greeting; it may serve one client alone: end the other program that uses it, "
+                "else restart it, or correct host and port"
+            ) from None
 
 
 def require_working_interface(channel: str, sysfs: Path = Path("/sys/class/net")) -> None:

@@ -256,6 +256,8 @@ def qualities(reliable, latched=False):
         Policy.Reliability.Reliable(0) if reliable else Policy.Reliability.BestEffort,
         Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
         Policy.History.KeepLast(10),
+        # As ROS 2 has it; without, one message is kept for those who come later.
+        Policy.DurabilityService(0, Policy.History.KeepLast(10), -1, -1, -1),
     )
 
 
@@ -289,28 +291,37 @@ def test_over_dds_an_estop_and_requests_arrive_whatever_the_publishers_quality_o
     assert "estop" in requests
 
 
-def test_over_dds_a_latched_estop_that_was_pressed_before_the_bridge_started_arrives(tmp_path, monkeypatch):
-    number, requests, ended = 14 + os.getpid() % 20 * 3, [], threading.Event()
+@pytest.mark.parametrize(
+    ("written", "expected"),
+    [([[True], [False]], {"estop"}), ([[False], [True]], {"estop"}), ([[True, False], [False, True, False]], set())],
+)
+def test_over_dds_a_latched_estop_counts_if_it_was_in_force_when_the_bridge_started(
+    tmp_path, monkeypatch, request, written, expected
+):
+    """`written`: what each publisher sent before, oldest first."""
+    number = 14 + os.getpid() % 20 * 3 + request.node.callspec.indices["written"]
+    requests, ended = [], threading.Event()
     joined = Domain(number, msg.LOOPBACK), DomainParticipant(number)
     monkeypatch.setattr("disco_hw.bridge.ros2.join_domain", lambda _: joined)
-    writers = [
-        DataWriter(joined[1], Topic(joined[1], f"rt/{name}", kind), qualities(reliable=True, latched=True))
-        for name, kind in (("disco_hw/estop", msg.Bool), ("disco_hw/ctl", msg.String))
-    ]
-    writers[0].write(msg.Bool(True))
+    latched = qualities(reliable=True, latched=True)
+    ctl = DataWriter(joined[1], Topic(joined[1], "rt/disco_hw/ctl", msg.String), latched)
     # A request is of the time at which it was made.
-    writers[1].write(msg.String("stop"))
+    ctl.write(msg.String("stop"))
+    buttons = [DataWriter(joined[1], Topic(joined[1], "rt/disco_hw/estop", msg.Bool), latched) for _ in written]
+    for button, pressed in zip(buttons, written, strict=True):
+        for one in pressed:
+            button.write(msg.Bool(one))
     with closing(Bridge(load_setup(robot_file(tmp_path)))) as bridge:
         for errands in (bridge._asking, bridge._stopping):
             errands.add = lambda _, request: requests.append(request)
         thread = threading.Thread(target=bridge.run, args=(ended.is_set,))
         thread.start()
-        deadline = time.monotonic() + 20.0
+        deadline = time.monotonic() + (20.0 if expected else 0.4)
         while not requests and time.monotonic() < deadline:
             time.sleep(0.01)
         ended.set()
         thread.join()
-    assert set(requests) == {"estop"}
+    assert set(requests) == expected
 
 
 def test_over_dds_a_message_counts_once_also_if_its_publisher_has_gone():

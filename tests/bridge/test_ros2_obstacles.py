@@ -149,6 +149,29 @@ def test_an_array_that_is_refused_or_another_publishers_removes_none(partial):
     assert inlet.datagrams(whole, WALL_NS, WALL_NS, publisher="another")[1:] == []
 
 
+def later_array(count, after_s, inlet, publisher):
+    """Return the names of those removed by an array of `count` numbered obstacles that comes so much later."""
+    at_ns = WALL_NS + round(after_s * 1e9)
+    message = msg.ObstacleArrayMsg(msg.Header(msg.stamp_of(at_ns), "map"), [obstacle(number=0)] * count)
+    found = [one for datagram in inlet.datagrams(message, at_ns, at_ns, publisher) for one in reports_in(datagram)]
+    return [one.name for one in found if one.removed]
+
+
+def test_a_sender_that_restarts_takes_over_the_numbered_obstacles_of_before():
+    inlet = ObstacleInlet("map")
+    later_array(4, 0.0, inlet, "first")
+    assert later_array(2, 0.5, inlet, "restarted") == []
+    # A removal is repeated, as a datagram can be lost.
+    assert [later_array(2, at_s, inlet, "restarted") for at_s in (1.5, 3.0)] == 2 * [["ros2.0.3", "ros2.0.4"]]
+
+
+def test_a_sender_that_is_silent_loses_nothing_to_one_that_was_there_beside_it():
+    inlet = ObstacleInlet("map")
+    later_array(0, 0.0, inlet, "beside")
+    later_array(4, 0.1, inlet, "first")
+    assert later_array(0, 5.0, inlet, "beside") == []
+
+
 def test_an_array_without_a_frame_is_refused_with_what_to_do():
     inlet = ObstacleInlet("map")
     received(array(obstacle(), frame=""), inlet)

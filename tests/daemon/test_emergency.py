@@ -245,6 +245,24 @@ def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_be
         assert b"\rt080" in os.read(robot_end, 4096)
 
 
+@pytest.mark.parametrize("asked_in_vain", [True, False])
+def test_the_stop_does_not_wait_for_a_daemon_that_was_just_asked_in_vain(tmp_path, line, monkeypatch, asked_in_vain):
+    robot_end, host_end = line
+    tty.setraw(host_end)
+    is_out = []
+
+    def request(_):
+        is_out.append(bool(select.select([robot_end], [], [], 0.0)[0]))
+        return False, "no answer"
+
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
+    monkeypatch.setattr(emergency, "_request_stop", request)
+    channel = {"/tmp/disco-hw-wombot.can": os.ttyname(host_end)}
+    robot = robot_file(tmp_path, tmp_path / "none", link='interface = "slcan"', **channel)
+    outcome = stop_robot(robot, asked_in_vain=asked_in_vain)
+    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [asked_in_vain])
+
+
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
 def test_a_link_option_that_says_nothing_is_refused_with_what_to_write(tmp_path, option):
     with pytest.raises(InputError, match=f"--link {option}: .*write can, serial, can:INTERFACE:CHANNEL or serial:PORT"):

@@ -253,9 +253,25 @@ def test_the_first_refusal_of_a_kind_is_reported_and_holds_until_a_pose_is_used(
         t_ns = now_ns - round(1e9 * age_s) + number
         fusion.add_pose(msgspec.structs.replace(good, t_ns=t_ns, **changes), now_ns)
     assert fusion.sources.new_messages() == [f"natnet: {text}"]
-    assert fusion.sources.refusal == f"natnet: {text}"
+    assert fusion.sources.refusal(now_ns) == f"natnet: {text}"
     assert fusion.add_pose(good, now_ns).accepted
-    assert (fusion.sources.new_messages(), fusion.sources.refusal) == ([], "")
+    assert (fusion.sources.new_messages(), fusion.sources.refusal(now_ns)) == ([], "")
+
+
+def test_a_refusal_does_not_explain_why_later_poses_are_missing():
+    fusion = PoseFusion(Estimation(), GEOMETRY, 0.15, ("natnet",))
+    for wheels in DRIVE.wheels[:200]:
+        fusion.add_wheels(wheels)
+    now_ns = wheels.t_ns
+    good = PoseSample(now_ns, now_ns, 1.0, 2.0, 0.3, 0.01, 0.02)
+    many = [msgspec.structs.replace(good, t_ns=now_ns - 200_000_000 + 1_000_000 * k) for k in range(200)]
+    reasons = [fusion.add_pose(one, now_ns).reason for one in many]
+    assert reasons[-1] is PoseReason.OVERFLOW
+    assert "more than 100 poses a second" in fusion.sources.new_messages()[0]
+    assert fusion.sources.refusal(now_ns) == ""
+    fusion.add_pose(msgspec.structs.replace(good, t_ns=now_ns + 10**9), now_ns)
+    assert "in the future" in fusion.sources.refusal(now_ns)
+    assert fusion.sources.refusal(now_ns + 2 * 10**9) == ""
 
 
 def test_a_pose_from_before_the_first_wheel_sample_needs_no_remedy():
@@ -264,4 +280,4 @@ def test_a_pose_from_before_the_first_wheel_sample_needs_no_remedy():
     t_ns = DRIVE.wheels[0].t_ns
     update = fusion.add_pose(PoseSample(t_ns - 150_000_000, t_ns, 1.0, 2.0, 0.3, 0.01, 0.02), t_ns)
     assert update.reason is PoseReason.TOO_OLD
-    assert (fusion.sources.new_messages(), fusion.sources.refusal) == ([], "")
+    assert (fusion.sources.new_messages(), fusion.sources.refusal(t_ns)) == ([], "")

@@ -1,9 +1,10 @@
 import math
+from pathlib import Path
 
 import msgspec
 import pytest
 
-from disco_hw.config import Control, Link, Robot, RobotConfig
+from disco_hw.config import Control, Link, Robot, RobotConfig, link_of
 from disco_hw.runtime.pipeline import NoPlanner
 from disco_hw.runtime.preflight import (
     Level,
@@ -18,6 +19,7 @@ from disco_hw.runtime.preflight import (
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.runtime.supervisor import UserRequest
 from disco_hw.tasks.circle import CircleTask
+from disco_hw.tasks.lemniscate import LemniscateTask
 from disco_hw.tasks.path import PathTask
 from drivers.types import Limit, Limits, SafetyCard
 from tests.runtime.path_robot import task_robot
@@ -217,3 +219,21 @@ def test_the_safety_card_says_how_far_and_how_long_at_full_speed(brakes, level, 
     card = SafetyCard("the controller", "its watchdog", 0.1, brakes, "a frame")
     checks = check_safety(robot(max_wheel_acceleration_rad_s2=20.0), card)
     assert [(check.level, check.text) for check in checks if check.name == "stops by"] == [(level, expected)]
+
+
+@pytest.mark.parametrize("task", [CircleTask(radius_m=0.75), LemniscateTask(size_m=2.25)])
+def test_a_task_that_turns_faster_than_the_base_can_fails(task):
+    """Of an AgileX Scout 2.0; both have the same tightest bend."""
+    sizes = {"max_turn_rad_s": 0.5235, "max_speed_m_s": 1.5, "wheel_radius_m": 0.06, "track_m": 0.31}
+    link = link_of(Path("robot.toml"), {"driver": "agilex", "interface": "virtual", "channel": "can0", **sizes})
+
+    def found(speed_m_s):
+        wide = robot(max_wheel_speed_rad_s=20.0)
+        return check_task(RobotConfig(robot=wide, link=link, task=msgspec.structs.replace(task, speed_m_s=speed_m_s)))
+
+    assert found(0.392).level is Level.OK
+    assert "the wheels can do 0.39 m/s on it" in found(0.392).text
+    too_fast = found(0.4)
+    assert too_fast.level is Level.FAIL
+    assert too_fast.text.startswith("task.speed_m_s: ")
+    assert too_fast.text.endswith("; write at most 0.392 m/s, or a larger figure")

@@ -198,7 +198,11 @@ def epochs(position_hz, heading_hz, heading_ms, seconds=2):
 
 @pytest.mark.parametrize(
     ("position_hz", "heading_hz", "heading_ms"),
-    [(20, 1, 2), (20, 5, 2), (20, 20, 2), (10, 10, 2), (10, 10, 45), (10, 10, -10), (20, 20, -10), (5, 1, 30)],
+    [
+        (20, 1, 2), (20, 5, 2), (20, 20, 2), (10, 10, 2), (10, 10, 45), (10, 10, -10), (20, 20, -10), (5, 1, 30),
+        # GGA alone takes 22 ms at 38 400 baud.
+        (5, 5, -22), (10, 10, -45),
+    ],
 )  # fmt: skip
 def test_no_position_is_lost_and_each_heading_goes_with_the_position_of_its_epoch(position_hz, heading_hz, heading_ms):
     found = epochs(position_hz, heading_hz, heading_ms)
