@@ -110,7 +110,7 @@ class Gamepad:
                 if self._dropping:
                     self._dropping = False
                     self._read_state()
-                self._judge_press()
+                self._evaluate_press()
             # The kernel's queue ran over: what comes until the next report is of no use.
             self._dropping = self._dropping or event.code == _SYN_DROPPED
         elif self._dropping:
@@ -120,7 +120,7 @@ class Gamepad:
         elif event.type == _EV_ABS and event.code in self._raw:
             self._raw[event.code] = self._share(event.code, event.value)
 
-    def _judge_press(self) -> None:
+    def _evaluate_press(self) -> None:
         """Refuse a press of the deadman with an axis off its middle, both before and after the report that has it.
 
         Before the first report of some pads the kernel has 0 for an axis, which may be its end.

@@ -200,7 +200,7 @@ def request_daemon(robot: Path, request: str, link: str | None) -> dict[str, Any
         action, *changes = shlex.split(request) or [""]
     except ValueError as error:
         return {"do": request[:80], "ok": False, "error": str(error)}
-    unrecorded, asked = "--unrecorded" in changes, True
+    unrecorded, has_daemon = "--unrecorded" in changes, True
     try:
         reply = ask(robot, action, [change for change in changes if change != "--unrecorded"], unrecorded)
         if reply.get("ok") or action != "estop":
@@ -208,11 +208,11 @@ def request_daemon(robot: Path, request: str, link: str | None) -> dict[str, Any
         refused = str(reply.get("error"))
     except (InputError, WorkError) as error:
         # robot.toml that cannot be read names no daemon to ask.
-        refused, asked = str(error), isinstance(error, WorkError)
+        refused, has_daemon = str(error), isinstance(error, WorkError)
     if action != "estop":
         return {"do": action, "ok": False, "error": refused}
     try:
-        outcome = stop_robot(robot, link, asked_in_vain=asked)
+        outcome = stop_robot(robot, link, daemon_failed=has_daemon)
     except InputError as error:
         return {"do": action, "ok": False, "error": f"NOT SENT: {error}"}
     return {"do": action, "ok": outcome.confirmed, "text" if outcome.confirmed else "error": outcome.as_text()}

@@ -251,8 +251,8 @@ def _check(path: Path, config: RobotConfig) -> None:
         _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
     driver = find_driver(config.link.driver)
     # Every other medium carries CAN frames, as the one of that name does (docs/add-a-transport.md).
-    spoken = "serial" if config.link.kind == "serial" else "can"
-    if spoken not in driver.kinds:
+    medium = "serial" if config.link.kind == "serial" else "can"
+    if medium not in driver.kinds:
         known = " or ".join(f'"{kind}"' for kind in driver.kinds)
         _refuse(
             path, "link.kind", f'the driver {driver.name} does not speak over "{config.link.kind}"', f"write {known}"

@@ -102,12 +102,12 @@ class EstopOutcome:
 
 
 def stop_robot(
-    robot: Path, link: str | None = None, kept: Mapping[str, Any] | None = None, *, asked_in_vain: bool = False
+    robot: Path, link: str | None = None, kept: Mapping[str, Any] | None = None, *, daemon_failed: bool = False
 ) -> EstopOutcome:
     """Send the e-stop on the link and through the daemon, and wait half a second for the robot to confirm.
 
     `link` is what the option --link says; `kept`, what `read_robot_toml` read of the file before, is used where it
-    cannot be read now. `asked_in_vain`: the daemon was just asked, and is waited for no more before the link is used.
+    cannot be read now. `daemon_failed`: the daemon was just asked, and is waited for no more before the link is used.
 
     Raises InputError only when neither it nor the file says where the link is, and no daemon takes the stop either.
     """
@@ -130,7 +130,7 @@ def stop_robot(
     way = _stop_over_exchange if is_exchange else _stop_over_serial if is_serial else _stop_over_transport
     address = settings.port if is_serial else f"{settings.interface} {settings.channel}"
     outcome = EstopOutcome(address, None, None, False, refused, file_error, driver.latches_stop)
-    if not asked_in_vain and (is_exchange or (not is_serial and settings.interface in OVER_A_TTY)):
+    if not daemon_failed and (is_exchange or (not is_serial and settings.interface in OVER_A_TTY)):
         # Two that speak at once on a line of exchanges spoil each other's packets, and a second opening of an adapter
         # closes its CAN channel under the daemon when it ends: the daemon first, which has the line.
         daemon_confirmed, daemon_error = _request_stop(socket_path)

@@ -15,7 +15,7 @@ _STOP_RAD_S = 0.02
 # A stop that takes no more than this share of the time is at once.
 _LEAST_SHARE = 1e-3
 # Chosen: below this share no operator sees a ramp in a stop.
-_TOLD_AT_ONCE = 0.05
+_NEGLIGIBLE_SHARE = 0.05
 # How long the fastest speed that was commanded takes to reach, where a fit begins (s).
 RISES_S = (0.3, 1.0, 4.0)
 
@@ -77,8 +77,8 @@ def starts(driven: CommandedDrive) -> tuple[tuple[float, ...], ...]:
 
 def stop_wording(values: Mapping[str, float]) -> str:
     """Return the text on how long a stop takes."""
-    at_once = values["stop_share"] <= _TOLD_AT_ONCE
-    return "a wheel stops at once" if at_once else "a stop takes {stop_share:.2f} of that time"
+    is_immediate = values["stop_share"] <= _NEGLIGIBLE_SHARE
+    return "a wheel stops at once" if is_immediate else "a stop takes {stop_share:.2f} of that time"
 
 
 EFFECT = Effect(

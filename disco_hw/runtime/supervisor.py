@@ -15,7 +15,7 @@ from firmware_protocol.status_codes import BY_ITSELF, THEN_RESET, THEN_RESTART
 FIND_HEADING = "the pose sensor measures none: drive one metre straight ahead by hand, on the page, to find it"
 AFTER_A_JUMP = "check that the robot is where the page shows it, then start again"
 # Chosen: nearer is what the plans of a drive without trouble leave.
-BESIDE_END_M = 0.1
+OFF_END_M = 0.1
 _IDLE = frozenset({DriverState.STANDBY, DriverState.READY})
 _MAY_MOVE = frozenset({DriverState.ARMING, DriverState.ARMED, DriverState.STOPPING})
 _ROBOT_HAS_FAULT = C.ROBOT_ESTOP | C.ROBOT_FAULT | C.ROBOT_REFUSED
@@ -350,15 +350,15 @@ class Supervisor:
             )
         elif self._running and inputs.task_finished:
             self._running = False
-            beside = inputs.off_end_m > BESIDE_END_M
+            is_off = inputs.off_end_m > OFF_END_M
             if just_started:
-                off = f", {inputs.off_end_m:.2f} m off" if beside else ""
+                off = f", {inputs.off_end_m:.2f} m off" if is_off else ""
                 self._events.append(
                     f"task stopped: nothing was driven, as the nearest place of the path is its end{off}; put the "
                     "robot at the first way-point and start again"
                 )
             else:
-                off = f", {inputs.off_end_m:.2f} m beside it" if beside else ""
+                off = f", {inputs.off_end_m:.2f} m beside it" if is_off else ""
                 self._events.append(f"task stopped: the end of the path is reached{off}")
 
     def _fault_and_hint(self, hint: str) -> str:

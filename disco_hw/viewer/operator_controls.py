@@ -202,7 +202,7 @@ class Desk:
             refused = str(error)
         try:
             with self._reserve.released():
-                outcome = stop_robot(self._robot_file, self._link, self._robot_toml, asked_in_vain=True)
+                outcome = stop_robot(self._robot_file, self._link, self._robot_toml, daemon_failed=True)
         except InputError as error:
             return {"do": "estop", "ok": False, "error": f"{refused}; NOT SENT: {error}"}
         kind = "text" if outcome.confirmed else "error"

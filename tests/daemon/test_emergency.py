@@ -245,8 +245,8 @@ def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_be
         assert b"\rt080" in os.read(robot_end, 4096)
 
 
-@pytest.mark.parametrize("asked_in_vain", [True, False])
-def test_the_stop_does_not_wait_for_a_daemon_that_was_just_asked_in_vain(tmp_path, line, monkeypatch, asked_in_vain):
+@pytest.mark.parametrize("daemon_failed", [True, False])
+def test_the_stop_does_not_wait_for_a_daemon_that_has_just_failed_to_answer(tmp_path, line, monkeypatch, daemon_failed):
     robot_end, host_end = line
     tty.setraw(host_end)
     is_out = []
@@ -259,8 +259,8 @@ def test_the_stop_does_not_wait_for_a_daemon_that_was_just_asked_in_vain(tmp_pat
     monkeypatch.setattr(emergency, "_request_stop", request)
     channel = {"/tmp/disco-hw-wombot.can": os.ttyname(host_end)}
     robot = robot_file(tmp_path, tmp_path / "none", link='interface = "slcan"', **channel)
-    outcome = stop_robot(robot, asked_in_vain=asked_in_vain)
-    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [asked_in_vain])
+    outcome = stop_robot(robot, daemon_failed=daemon_failed)
+    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [daemon_failed])
 
 
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
