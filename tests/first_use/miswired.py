@@ -112,11 +112,12 @@ class MiswiredRobot:
         config = setup.config
         name = config.link.driver
         if name in (None, "reference"):
-            robot = config.robot
+            # It allows what robot.toml asks for, in turns as it counts them: as `check` says where a ratio is written.
+            robot, ratio = config.robot, config.wheels.turn_ratio
             firmware = FirmwareConfig(
                 ticks_per_rev=plant.ticks_per_rev,
-                max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s,
-                max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2,
+                max_wheel_speed_rad_s=robot.max_wheel_speed_rad_s / ratio,
+                max_wheel_acceleration_rad_s2=robot.max_wheel_acceleration_rad_s2 / ratio,
                 cycle_s=1e-6 * step_us,
             )
             self.board = VirtualRobot(self.plant, firmware)
