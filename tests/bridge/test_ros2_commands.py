@@ -8,6 +8,7 @@ import random
 import threading
 import time
 from contextlib import closing
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -25,9 +26,11 @@ from disco_hw.bridge.ros2 import LATCHED, RELIABLE, SENSOR, Bridge, TopicReaders
 from disco_hw.bridge.ros2_commands import Errands, SpeedInlet, refusal
 from disco_hw.config import Drive, Robot
 from disco_hw.config.robot import Ros2
+from disco_hw.daemon.emergency import EstopOutcome
 from disco_hw.drive import PageSource, RobotView, steering_from
 from disco_hw.drive.hand_pilot import Deadman
 from disco_hw.drive.terminal import wheel_speeds
+from disco_hw.errors import InputError, WorkError
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime import State
 from disco_hw.runtime.robot_setup import load_setup
@@ -341,3 +344,23 @@ def test_over_dds_a_message_counts_once_also_if_its_publisher_has_gone():
     del writer
     assert not readers.has_publisher()
     assert unread == UnreadCounts()
+
+
+@pytest.mark.parametrize(
+    ("failure", "daemon_failed"),
+    [(WorkError("no answer"), True), (InputError("robot.toml: not to be read"), False)],
+    ids=["daemon", "robot.toml"],
+)
+def test_an_estop_goes_to_the_link_at_once_where_the_daemon_has_just_failed(monkeypatch, failure, daemon_failed):
+    def fail(*_):
+        raise failure
+
+    given = []
+    monkeypatch.setattr(ros2_commands, "ask", fail)
+    monkeypatch.setattr(
+        ros2_commands,
+        "stop_robot",
+        lambda *_, **options: given.append(options) or EstopOutcome("link", None, None, True),
+    )
+    assert ros2_commands.request_daemon(Path("robot.toml"), "estop", None)["do"] == "estop"
+    assert given == [{"daemon_failed": daemon_failed}]
