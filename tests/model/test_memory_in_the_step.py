@@ -7,13 +7,11 @@ from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, sa
 from disco_hw.model.model import coefficient_tables
 from disco_hw.model.step import FreeRun, simulate
 from disco_hw.model.terms import BODY_MEMORIES, BODY_TARGETS, COMMAND_MEMORIES, TERMS, memories_of
+from tests.model.one_kernel import BASE, DIRECTION, LOAD, RUBBER, SLIPPING, effects_of
 from tests.model.reference import reference_run
 
-BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05
 DRIVE = np.repeat([[4.0, 4.0], [-3.0, 2.0], [6.0, 1.0], [0.0, 0.5], [-5.0, -4.0]], 6, axis=0)
-DIRECTION, LOAD = "command += k sign(u - mean_0.3s(u))", "command += k u mean_1s(|u| + |u_other|)"
-RUBBER, SLIPPING = "omega += k (omega - mean_1s(omega))", "v_x += k (v - slewed_2(v))"
 EVERY = [f"command += k {form}" for form in COMMAND_MEMORIES]
 EVERY += [f"{target} += k {form}" for target in BODY_TARGETS for form in BODY_MEMORIES[target]]
 
@@ -22,11 +20,10 @@ def model_of(*effects):
     return Model(*BASE, effects=effects)
 
 
-def a_few(direction=0.3, load=-0.01, rubber=-0.5, lag_s=0.0):
-    """The terms that most tests here compile, among others; at zero a term adds nothing."""
-    others = EffectSetting("motor_lag", {"tau_s": lag_s}), EffectSetting("command += k u |u|", {"k": 0.0})
-    terms = {DIRECTION: direction, LOAD: load, RUBBER: rubber}
-    return model_of(*others, *(EffectSetting(name, {"k": k}) for name, k in terms.items()))
+def a_few(direction=0.3, load=-0.01, rubber=-0.5, lag_s=0.0, slipping=0.0):
+    """The terms that most tests here are of, among others."""
+    numbers = {DIRECTION: direction, LOAD: load, RUBBER: rubber, SLIPPING: slipping}
+    return model_of(*effects_of(numbers, lag_s=lag_s))
 
 
 def run(model, commands, step_s=STEP_S, means=None, start=(0.0,) * 5):
@@ -64,16 +61,16 @@ def test_a_body_turns_by_the_feature_of_how_its_wheels_turned():
 
 def test_a_robot_whose_tyres_slip_goes_by_what_they_grip():
     """Wheels of 60 mm that spin up to 0.24 m/s at once, and 2 m/s^2: in steps of 0.1 m/s."""
-    model = model_of(EffectSetting(SLIPPING, {"k": -1.0}))
+    model = a_few(0.0, 0.0, 0.0, slipping=-1.0)
     np.testing.assert_allclose(run(model, DRIVE), reference_run(model, DRIVE, STEP_S), atol=1e-12)
-    means = np.zeros(1)
+    means = np.zeros(6)
     ahead = run(model, np.full((4, 2), 4.0), means=means)[:, 0]
     assert np.diff(ahead) == pytest.approx([0.05 * 0.05, 0.05 * 0.15, 0.05 * (0.24 - 0.04 * 0.4 / 2.0), 0.05 * 0.24])
-    # Kept in rad/s of both wheels, as they are measured.
-    assert means == pytest.approx([8.0])
+    # Kept in rad/s of both wheels, as they are measured, after what the two terms of commands remember of each wheel.
+    assert means[4] == pytest.approx(8.0)
     wheels = 0.03 * DRIVE.sum(axis=1)
     behind = BODY_MEMORIES["v_x"]["(v - slewed_2(v))"].at_nodes(STEP_S, wheels, 0.0 * wheels)
-    turns, found = np.diff(run(model_of(), DRIVE), axis=0), np.diff(run(model, DRIVE), axis=0)
+    turns, found = np.diff(run(a_few(0.0, 0.0, 0.0), DRIVE), axis=0), np.diff(run(model, DRIVE), axis=0)
     way = np.hypot(*found[:, :2].T)
     sideways = 0.1 * np.abs(turns[:, 2])
     chord = np.sinc(0.5 * turns[:, 2] / np.pi)
@@ -92,7 +89,7 @@ def test_longer_steps_lead_to_the_same_place():
 
 
 def test_a_run_goes_on_from_what_another_remembered():
-    model, means = a_few(), np.zeros(5)
+    model, means = a_few(), np.zeros(6)
     single_run = run(model, DRIVE)
     first = run(model, DRIVE[:13], means=means)
     without_memory = run(model, DRIVE[13:], start=first[-1])

@@ -8,9 +8,9 @@ from disco_hw.model import EffectSetting, Gaussian, Model, load_model, plain, sa
 from disco_hw.model.step import FreeRun
 from disco_hw.model.terms import BODY_FEATURES, BODY_MEMORIES, BODY_TARGETS, COMMAND_FEATURES, COMMAND_MEMORIES, TERMS
 from tests.model import features
+from tests.model.one_kernel import ASIDE, BASE, DIRECTION, DRAG, DROOP, RUBBER, SPIN, effects_of
 from tests.model.reference import reference_run
 
-BASE = (0.06, 0.4, 0.1)
 STEP_S = 0.05
 DRIVE = np.repeat([[4.0, 4.0], [-3.0, 2.0], [6.0, 1.0], [0.0, 0.5], [-5.0, -4.0]], 6, axis=0)
 
@@ -30,26 +30,23 @@ def every_term(target, features):
     )
 
 
-def within(reach):
-    """A term of each kind, of what is now and of what was before, of which each is somewhere beyond its reach."""
-    terms = {
-        "command += k u |u|": (0.01, 9.0), "command += k sign(u - mean_1s(u))": (0.3, 0.6),
-        "v_x += k v^3": (-9.0, 3e-3), "v_y += k omega^3": (0.2, 0.05),
-        "omega += k (omega - mean_1s(omega))": (-0.3, 0.1),
-    }  # fmt: skip
-    return tuple(EffectSetting(name, {"k": k, **({"reach": far} if reach else {})}) for name, (k, far) in terms.items())
+# A term of each kind, of what is now and of what was before, of which each is somewhere beyond its reach.
+NUMBERS = {DROOP: 0.01, DIRECTION: 0.3, DRAG: -9.0, ASIDE: 0.2, RUBBER: -0.3}
+REACHES = {DROOP: 9.0, DIRECTION: 0.6, DRAG: 3e-3, ASIDE: 0.05, RUBBER: 0.1}
 
 
 def test_no_term_goes_on_beyond_its_reach():
-    kept = compiled(within(reach=True))
-    np.testing.assert_allclose(kept, by_reference(within(reach=True)), atol=1e-9)
+    within = effects_of(NUMBERS, REACHES)
+    kept = compiled(within)
+    np.testing.assert_allclose(kept, by_reference(within), atol=1e-9)
     # Each of the states feels it: x, y and yaw by the terms of the body, wheels by those of commands.
-    assert (np.abs(kept - compiled(within(reach=False))).max(axis=0) > 1e-3).all()
-    drag, v = EffectSetting("v_x += k v^3", {"k": -4.0, "reach": 0.005}), 0.06 * 4.0
-    dragged = compiled((drag, *three_terms()[1:]))
+    assert (np.abs(kept - compiled(effects_of(NUMBERS))).max(axis=0) > 1e-3).all()
+    v = 0.06 * 4.0
+    dragged = compiled(effects_of({DRAG: -4.0}, {DRAG: 0.005}))
     assert dragged[6, 0] == pytest.approx((v - 4.0 * 0.005) * 0.3)
     back = dragged[12] - dragged[6]
-    turned = compiled(())[12] - compiled(())[6]
+    plain_run = compiled(effects_of({}))
+    turned = plain_run[12] - plain_run[6]
     assert back[2] == pytest.approx(turned[2])
 
 
@@ -88,12 +85,6 @@ def test_every_memory_follows_what_its_name_says():
             np.testing.assert_allclose(one_by_one, end, atol=1e-12, err_msg=name)
 
 
-def three_terms(drag=0.0, droop=0.0, spin=0.0):
-    """One term of each kind, so that one kernel is compiled; at zero a term adds nothing."""
-    terms = {"v_x += k v^3": drag, "command += k u |u|": droop, "omega += k omega": spin}
-    return tuple(EffectSetting(name, {"k": k}) for name, k in terms.items())
-
-
 def test_each_single_term_adds_what_it_says():
     # Features one by one by hand: two plain libraries could share a slip in the pairing of names and formulas.
     u, other = np.array([2.0, -3.0]), np.array([-3.0, 2.0])
@@ -104,15 +95,15 @@ def test_each_single_term_adds_what_it_says():
     assert BODY_FEATURES["omega / (2 + 5 |omega|)"](0.0, -2.0, 0.0, 0.0) == pytest.approx(-1.0 / 6.0)
     assert BODY_FEATURES["v |a|"](-0.5, 0.0, -2.0, 0.0) == pytest.approx(-1.0)
     v = 0.06 * 4.0
-    assert compiled(three_terms(drag=-0.4))[6, 0] == pytest.approx((v - 0.4 * v**3) * 0.3)
-    drooped = compiled(three_terms(droop=-0.01))
+    assert compiled(effects_of({DRAG: -0.4}))[6, 0] == pytest.approx((v - 0.4 * v**3) * 0.3)
+    drooped = compiled(effects_of({DROOP: -0.01}))
     assert drooped[6, 3:] == pytest.approx([3.84, 3.84])
     assert drooped[12, 3:] == pytest.approx([-2.91, 1.96])
 
 
 def test_a_term_on_the_yaw_rate_turns_about_the_axle():
-    spun = compiled(three_terms(spin=0.5))
-    wider = Model(0.06, 0.4 / 1.5, 0.1)
+    spun = compiled(effects_of({SPIN: 0.5}))
+    wider = Model(0.06, 0.4 / 1.5, 0.1, effects=effects_of({}))
     same = FreeRun(wider, wider.point()[None], STEP_S).states(np.zeros(5), DRIVE, 0, 60.0)
     np.testing.assert_allclose(spun, same, atol=1e-9)
 

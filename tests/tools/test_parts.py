@@ -1,6 +1,7 @@
 """How `make test` shares the tests between its workers."""
 
 import fcntl
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -11,19 +12,20 @@ from tests.conftest import PARTS, WITHOUT_KERNELS, KernelsFirst, is_in_part
 TESTS = Path(__file__).parents[1]
 
 
-def readers(path):
-    """Numbers of the workers that come to a file, through all folders on the way to it."""
-    way = [path, *(folder for folder in path.parents if folder.is_relative_to(TESTS))]
-    return [part for part in range(len(PARTS) + 1) if all(is_in_part(one, part) for one in way)]
+@cache
+def coming_to(path):
+    """Numbers of the workers that come to a file or folder, through all folders on the way to it."""
+    before = range(len(PARTS) + 1) if path == TESTS else coming_to(path.parent)
+    return [part for part in before if is_in_part(path, part)]
 
 
 def test_every_file_is_read_by_one_worker():
-    found = {str(path.relative_to(TESTS)): readers(path) for path in TESTS.rglob("test_*.py")}
+    found = {str(path.relative_to(TESTS)): coming_to(path) for path in TESTS.rglob("test_*.py")}
     assert {path: workers for path, workers in found.items() if len(workers) != 1} == {}
-    assert readers(TESTS / "hil" / "test_estop.py") == [0]
-    assert readers(TESTS / "firmware_protocol" / "emulated" / "test_board.py") == [0]
-    assert readers(TESTS / "firmware_protocol" / "test_codec.py") == [len(PARTS)]
-    assert readers(TESTS / "gap" / "search" / "test_needed.py") == [1]
+    assert coming_to(TESTS / "hil" / "test_estop.py") == [0]
+    assert coming_to(TESTS / "firmware_protocol" / "emulated" / "test_board.py") == [0]
+    assert coming_to(TESTS / "firmware_protocol" / "test_codec.py") == [len(PARTS)]
+    assert coming_to(TESTS / "gap" / "search" / "test_needed.py") == [1]
 
 
 def test_every_part_names_folders_that_there_are():
