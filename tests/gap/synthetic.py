@@ -114,9 +114,9 @@ def is_accepted(smaller, larger, proof, costs=(500.0, 450.0), layout=BODY, limit
     return chosen.acceptable(smaller, larger)
 
 
-def body_channel(seed=0, **effects):
+def body_channel(seed=0, drive=DRIVE * 3, **effects):
     """A body channel and its drive; its poses are the model's with these first parameters of motion effects."""
-    line = line_of(np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0))
+    line = line_of(np.repeat(np.array(drive, dtype=float), 200, axis=0))
     channel = body_on(line, poses_of(line, vector_of(**effects), seed=seed))
     return channel, channel.drive
 

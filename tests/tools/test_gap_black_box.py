@@ -48,9 +48,9 @@ def exact_drive(turns):
 
 @cache
 def simulated_halves():
-    """40 s of a simulated robot with slow motors, and the next 40 s, on the grid."""
+    """25 s of a simulated robot with slow motors, and the next 25 s, on the grid."""
     log = simulated_drive({"motor_lag": 0.15}, seed=3)
-    return [grid_drive(halves.between(log, *span_s)) for span_s in ((60.0, 100.0), (100.0, 140.0))]
+    return [grid_drive(halves.between(log, *span_s)) for span_s in ((90.0, 115.0), (115.0, 140.0))]
 
 
 @cache

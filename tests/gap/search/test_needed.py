@@ -17,12 +17,12 @@ from disco_hw.gap.search.analysis import GapAnalysis, final_fit
 from disco_hw.gap.search.channel_result import ChannelResult, ParameterEstimate
 from disco_hw.model import Model
 from tests.gap.search.test_lacking import analysis_of, found, told
-from tests.gap.synthetic import GEOMETRY, NOISE, body_channel, errors_in_stretches, selector_of
+from tests.gap.synthetic import DRIVE, GEOMETRY, NOISE, body_channel, errors_in_stretches, selector_of
 
 
 def kept_of(names):
     """What is kept of names that were found in a body that slips turning, the model and the notes of that."""
-    _, line = body_channel(turn_slip=0.08)
+    _, line = body_channel(turn_slip=0.08, drive=DRIVE)
     # Without commands it starts from the wheels as measured.
     line = replace(line, command_rad_s=np.full_like(line.command_rad_s, np.nan))
     start = body_channel()[0].neutral.copy()

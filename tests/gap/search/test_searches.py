@@ -47,7 +47,7 @@ def found_on(line, start=WHEEL.neutral, given=()):
 
 
 def test_what_slows_the_wheels_is_named_and_the_rest_is_what_they_are_read_with():
-    found = found_on(wheels_of(motor_lag=0.15))
+    found = found_on(wheels_of(motor_lag=0.15, drive=DRIVE * 2))
     assert found.names == ("motor_lag",)
     assert not found.unnamed
     assert found.fit.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
@@ -62,7 +62,7 @@ def test_what_slows_the_wheels_is_named_and_the_rest_is_what_they_are_read_with(
 
 
 def test_what_a_model_knows_of_the_wheels_is_refitted_and_not_found():
-    found = found_on(wheels_of(motor_lag=0.15), vector_of(WHEEL, motor_lag=0.1), ("motor_lag",))
+    found = found_on(wheels_of(motor_lag=0.15, drive=DRIVE), vector_of(WHEEL, motor_lag=0.1), ("motor_lag",))
     assert found.names == found.selector.given == ("motor_lag",)
     assert found.base.vector[WHEEL.place["motor_lag.tau_s"]] == pytest.approx(0.15, abs=0.002)
 
@@ -118,7 +118,7 @@ def test_wheels_with_a_term_that_has_no_name_have_it_found_with_its_number():
 
 
 def test_what_slips_is_named_and_the_rest_is_the_noise_of_the_poses():
-    channel, line = body_channel(turn_slip=0.08)
+    channel, line = body_channel(turn_slip=0.08, drive=DRIVE * 2)
     found = search_body(line, channel.neutral)
     assert found.names == ("turn_slip",)
     assert not found.unnamed
@@ -181,7 +181,7 @@ def test_what_a_model_knows_of_the_body_is_refitted_and_not_found():
 
 
 def test_a_body_with_a_term_that_has_no_name_has_it_found_with_its_number():
-    channel, line = body_channel()
+    channel, line = body_channel(drive=DRIVE)
     speed, p = line.speed_rad_s, channel.neutral
     v = 0.5 * p[0] * speed.sum(axis=1)
     extra = np.zeros((v.size, 3))
