@@ -9,15 +9,15 @@ import torch
 from torch import nn
 
 from disco_hw.gap.data import BODY
-from disco_hw.gap.data.gridded_drive import grid_drive
 from disco_hw.gap.noise.channels import BodyChannel
 from disco_hw.gap.search.cross_validation import displacement_error, find_starts, smoothed_poses
 from disco_hw.gap.settings import GRID_STEP_S
 from disco_hw.model import Model
-from tests.gap.synthetic import GEOMETRY, NOISE, line_of
+from tests.gap.synthetic import GEOMETRY, NOISE, answered, line_of, poses_of, vector_of
 from tools.gap import halves
 from tools.gap.black_box import STEP, BlackBox, Training, recent_speeds, train
 from tools.gap.logs import simulated_drive
+from tools.joystick import joystick
 
 QUICK = Training(networks=2, hidden=8, iterations=(30, 30))
 NOMINAL = Model(0.0625, 0.405, 0.25)
@@ -48,9 +48,15 @@ def exact_drive(turns):
 
 @cache
 def simulated_halves():
-    """25 s of a simulated robot with slow motors, and the next 25 s, on the grid."""
-    log = simulated_drive({"motor_lag": 0.15}, seed=3)
-    return [grid_drive(halves.between(log, *span_s)) for span_s in ((90.0, 115.0), (115.0, 140.0))]
+    """40 s of a robot with slow motors, driven by joystick, and 40 s of another drive of it, on the grid."""
+    return [slow_drive(seed) for seed in (3, 4)]
+
+
+def slow_drive(seed):
+    # 40 commands a second, 100 cells.
+    command = np.ascontiguousarray(np.repeat(joystick(seed, 40.0), 5, axis=0)[::2])
+    line = answered(command, motor_lag=0.15)
+    return replace(line, pose_values=poses_of(line, vector_of(), seed=seed))
 
 
 @cache
