@@ -35,6 +35,9 @@ def test_two_channels_in_a_row_are_the_model(effects):
     commands = np.column_stack([4 * np.sin(0.8 * t), 6 * np.sin(0.5 * t) + 1])
     p = {"wheels": WHEEL.neutral.copy(), "body": BODY.neutral.copy()}
     for name, value in zip(model.parameter_names, model.point(), strict=True):
+        # What does nothing is left out here, as a search leaves it out: that is compiled already.
+        if "." in name and name.partition(".")[0] not in effects:
+            continue
         for layout, key in ((WHEEL, "wheels"), (BODY, "body")):
             if name in layout.place:
                 p[key][layout.place[name]] = value
@@ -130,13 +133,11 @@ def test_poses_that_are_older_than_their_stamps_have_a_latency_above_zero(late_s
     assert np.abs(residual(late_s, node - 15)).max() > 0.02
 
 
-def test_a_limit_that_nothing_comes_near_runs_as_one_that_is_not_there():
+@pytest.mark.parametrize("limit", ["turning_buildup", "yaw_acceleration_limit"])
+def test_a_limit_that_nothing_comes_near_runs_as_one_that_is_not_there(limit):
     t_s = np.arange(N) * GRID_STEP_S
     commands = np.column_stack([4 * np.sin(0.8 * t_s), 6 * np.sign(np.sin(0.5 * t_s)) + 1])
-    absent, far, near = (
-        turned(commands, motor_lag=0.1, **limits)
-        for limits in ({}, *(dict.fromkeys(("turning_buildup", "yaw_acceleration_limit"), at) for at in (1e5, 1.0)))
-    )
+    absent, far, near = (turned(commands, motor_lag=0.1, **limits) for limits in ({}, {limit: 1e5}, {limit: 1.0}))
     np.testing.assert_allclose(far, absent, atol=1e-7)
     assert np.abs(near - absent).max() > 0.1
 
