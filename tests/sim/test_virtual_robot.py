@@ -195,11 +195,11 @@ def test_the_device_clock_has_its_own_start_and_speed():
     assert clock.at(0) == 5_000_000
     assert clock.at(1_000_000_000) == 5_000_000 + 1_000_040_000
     setup = Setup(clock=clock)
-    setup.run(20_000)
+    setup.run(6_000)
     times_us = setup.host.times
-    assert len(times_us) == 20
+    assert len(times_us) == 6
     assert times_us[0] == pytest.approx(5_000_000 + 7_000, abs=1000)
-    assert (times_us[-1] - times_us[0]) / 19e6 - 1.0 == pytest.approx(40e-6, abs=20e-6)
+    assert (times_us[-1] - times_us[0]) / 5e6 - 1.0 == pytest.approx(40e-6, abs=20e-6)
 
 
 def fault(setup):
