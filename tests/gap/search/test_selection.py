@@ -14,6 +14,7 @@ from disco_hw.gap.search.richest_model import DELAY_NAMES, candidates_of
 from disco_hw.gap.search.selection import Selector, Thresholds, body_moves
 from disco_hw.gap.settings import DEFAULT_SETTINGS, GRID_STEP_S
 from tests.gap.synthetic import (
+    DRIVE,
     GEOMETRY,
     LIMITS,
     body_channel,
@@ -28,7 +29,7 @@ from tests.gap.synthetic import (
 
 
 def selector(given=(), start=None, moves_m=0.001, **effects):
-    channel, _ = body_channel(**effects)
+    channel, _ = body_channel(drive=DRIVE * 2, **effects)
     return selector_of(channel, replace(LIMITS, moves_m=moves_m), given=given, start=start)
 
 

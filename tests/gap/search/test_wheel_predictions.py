@@ -21,7 +21,7 @@ MODEL = Model(*GEOMETRY)
 
 def analysed(names, **effects):
     """Wheels that answer their commands with these first parameters of effects, and what was found of them."""
-    command = np.repeat(np.array(DRIVE * 3, dtype=float), 200, axis=0)
+    command = np.repeat(np.array(DRIVE * 2, dtype=float), 200, axis=0)
     line = answered(command, **effects)
     found = searched(wheels_on(line, WheelNoise(reading_rad=1e-3)), names)
     return GapAnalysis(line, vector_of(), WHEEL.neutral, None, found)
