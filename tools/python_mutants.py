@@ -333,12 +333,15 @@ def touched_by(name: str) -> set[str]:
     modules = {one: module for one, module in sys.modules.items() if one.partition(".")[0] in PROJECT}
     # The compiled core's library has no file.
     files = {one: getattr(module, "__file__", None) for one, module in modules.items()}
-    imports = {one: imported_by(Path(file)) for one, file in files.items() if file and file.endswith(".py")}
+    tests = {one for one in files if one.startswith("tests")}
+    # What is no test imports none.
+    sources = {one: Path(file) for one, file in files.items() if file and file.endswith(".py") and one not in tests}
+    imports = {one: imported_by(file) for one, file in sources.items()}
     touched = {name}
     while True:
         more = {one for one, others in imports.items() if others & touched} - touched
         if not more:
-            return touched | {one for one in files if one.startswith("tests")}
+            return touched | tests
         touched |= more
 
 

@@ -31,7 +31,7 @@ def recorded(parameters=NOISY, seed=3, drive=DRIVE, **effects):
     plant = Plant(parameters, hidden_effects(effects), seed)
     speeds, ticks, truth, poses = [], [], [], []
     for left, right in drive:
-        for _ in range(200):
+        for _ in range(120):
             poses += plant.step(plant.now_us + 1000, left, right)
             state = plant.truth
             speeds.append((state.left_speed_rad_s, state.right_speed_rad_s))

@@ -32,7 +32,7 @@ def test_a_wheel_that_ceases_to_obey_stops_the_robot_in_time_and_for_the_right_c
 @pytest.mark.parametrize("driver", ["reference", pytest.param("roboclaw", marks=pytest.mark.thorough)])
 def test_mended_and_reset_it_can_be_armed_again_and_drives(driver):
     run = WheelFaultRun(driver, 0.2, "straight", seed=5)
-    assert run.drive(2.0) == []
+    assert run.drive(1.2) == []
     run.strike(WheelRun(driver, "disconnected", 0.2, "straight", "left"), 1.0)
     assert run.stack.core.last.output.state is State.FAULT
     run.board.faults.set_active([])
@@ -40,7 +40,7 @@ def test_mended_and_reset_it_can_be_armed_again_and_drives(driver):
     run.stack.run(1.0, UserRequest.RESET)
     run.stack.run(0.5, UserRequest.ARM)
     run.stack.run(0.1, UserRequest.START)
-    assert all(tick.output.motion_allowed for tick in run.stack.ticks(1.0))
+    assert all(tick.output.motion_allowed for tick in run.stack.ticks(0.5))
 
 
 def test_a_healthy_robot_on_rough_ground_is_left_alone():
