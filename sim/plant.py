@@ -95,6 +95,11 @@ class Plant:
         return self._encoders.speeds_rad_s
 
     @property
+    def wheel_speeds_rad_s(self) -> tuple[float, float]:
+        """True wheel speeds now, left and right."""
+        return self._wheels.speeds_rad_s
+
+    @property
     def truth(self) -> TrueState:
         """The true state now."""
         pose = self._body.pose

@@ -185,11 +185,8 @@ class VendorRobot:
 
     def _setpoints(self, wheels: tuple[float | None, float | None]) -> tuple[float, float]:
         """Return the plant's setpoints (rad/s); a released side beside a driven one keeps its own speed."""
-        truth = self.plant.truth
         given = []
-        for side, (speed, own) in enumerate(
-            zip(wheels, (truth.left_speed_rad_s, truth.right_speed_rad_s), strict=True)
-        ):
+        for side, (speed, own) in enumerate(zip(wheels, self.plant.wheel_speeds_rad_s, strict=True)):
             if speed is not None:
                 self._coasting[side] = own
                 given.append(speed)

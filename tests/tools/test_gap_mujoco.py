@@ -191,7 +191,7 @@ def test_a_robot_is_one_with_a_name_or_the_one_that_a_number_draws(capsys):
     radii_m = np.array([drawn(number).wheel_radius_m for number in range(40)])
     assert 0.055 < radii_m.min() < 0.07
     assert 0.16 < radii_m.max() < 0.19
-    masses_kg = [robot.base_kg + 4.0 * (robot.wheel_kg + 0.13) for robot in map(drawn, range(2000))]
+    masses_kg = [robot.base_kg + 4.0 * (robot.wheel_kg + 0.13) for robot in map(drawn, range(500))]
     assert 3.0 < min(masses_kg) < 4.0
     assert 120.0 < max(masses_kg) < 140.0
     habits = [drawn(number).habits for number in range(100, 200)]

@@ -22,7 +22,7 @@ SUBSET = [
 
 @pytest.mark.parametrize("job", SUBSET, ids=lambda job: f"{job[0]}-{job[1]}")
 def test_a_wheel_that_ceases_to_obey_stops_the_robot_in_time_and_for_the_right_cause(job, monkeypatch):
-    monkeypatch.setattr(wheel_fault_campaign, "WARM_UP_S", (2.5, 3.5))
+    monkeypatch.setattr(wheel_fault_campaign, "WARM_UP_S", (2.4, 2.6))
     run = strike(job)
     assert not run.is_missed, f"{run.stopped_s:.2f} s, {run.travel_rad:.2f} rad"
     assert run.status_text
