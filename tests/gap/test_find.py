@@ -30,9 +30,9 @@ def first_s(log, seconds):
 @cache
 def report_of(*hidden, seed=902, drive="rich", dirty=False):
     log = simulated_drive(dict(hidden), seed=seed, drive=drive, dirty=dirty)
-    # A lag shows in the first half a minute, and pictures of one report are enough to look at.
+    # A lag shows in the first 20 s, and pictures of one report are enough to look at.
     is_lag = bool(hidden) and hidden[0][0] == "motor_lag"
-    return find_gap(first_s(log, 30.0) if is_lag else log, MODEL, pictures=is_lag)
+    return find_gap(first_s(log, 20.0) if is_lag else log, MODEL, pictures=is_lag)
 
 
 @pytest.mark.thorough
