@@ -11,6 +11,7 @@ import pytest
 from disco_hw.estimation.odometry import OdometryParameters
 from disco_hw.runtime.wheel_faults import Cause, WheelFaults
 from drivers.types import PoseSample, WheelCommand, WheelSample
+from tests.tables import thinned
 
 RADIUS_M, TRACK_M = 0.07, 0.44
 GEOMETRY = OdometryParameters(RADIUS_M, TRACK_M, 0.1, ((1e-6, 0.0, 0.0), (0.0, 1e-6, 0.0), (0.0, 0.0, 1e-6)))
@@ -99,8 +100,8 @@ UNDECIDED = {
 
 
 @pytest.mark.parametrize(("turns", "counts", "cause"), FAULTS)
-@pytest.mark.parametrize("speed", [SLOW, 0.8, FAST])
-@pytest.mark.parametrize("way", [1.0, -1.0], ids=["forward", "backward"])
+@thinned("speed", [SLOW, 0.8, FAST], quick=2)
+@thinned("way", [-1.0, 1.0], ids=["backward", "forward"], quick=1)
 def test_a_wheel_that_ceases_to_obey_is_found_within_seven_tenths_of_a_second(turns, counts, cause, speed, way):
     robot = Robot()
     command = tuple(way * each for each in around(speed))
