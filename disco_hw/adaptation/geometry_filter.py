@@ -96,7 +96,12 @@ _DRIFTS = [_DRIFT_X, _DRIFT_Y]
 _BELIEVED, _OTHER_GROUND = 0, 1
 _THETA = slice(_RADIUS, _X_ICR + 1)
 _SLIPS = slice(_LEFT, _RIGHT + 1)
-_DRIVEN, _EVERY = [_RADIUS, _AXLE, _LEFT, _RIGHT], range(_SIZE)
+
+
+def _diagonals(matrices: Array) -> Array:
+    """Return a view of the diagonals (N, 12) of contiguous matrices (N, 12, 12)."""
+    view: Array = matrices.reshape(len(matrices), -1)[:, :: _SIZE + 1]
+    return view
 
 
 class _Bank:
@@ -125,8 +130,8 @@ class _Bank:
         keep = math.exp(-dt_s / SLIP_S)
 
         # Derivatives of way and turn by (radius, axle, slip left, slip right), then of the displacement.
-        by_way = np.stack([way / radius, 0.0 * way, -0.5 * radius * left, -0.5 * radius * right], axis=1)
-        by_turn = np.stack([turn / radius, -turn / axle, radius * left / axle, -radius * right / axle], axis=1)
+        by_way = np.array([way / radius, 0.0 * way, -0.5 * radius * left, -0.5 * radius * right])
+        by_turn = np.array([turn / radius, -turn / axle, radius * left / axle, -radius * right / axle])
         x_by_turn = -0.5 * way * sine + x_icr * (sine + 0.5 * turn * cosine)
         y_by_turn = 0.5 * way * cosine - x_icr * (cosine - 0.5 * turn * sine)
         # A body that begins or ends a turn slides to its new motion.
@@ -136,15 +141,20 @@ class _Bank:
         self._sliding_rad_s = self._sliding_rad_s + slides * lags_rad_s
         move_x, move_y = way * cosine + x_icr * sideways * sine, way * sine - x_icr * sideways * cosine
         move_x, move_y = move_x + state[:, _DRIFT_X] * dt_s, move_y + state[:, _DRIFT_Y] * dt_s
-        step = np.broadcast_to(np.eye(_SIZE), (len(state), _SIZE, _SIZE)).copy()
+        step = np.zeros((len(state), _SIZE, _SIZE))
+        _diagonals(step)[:] = 1.0
         step[:, _X, _YAW], step[:, _Y, _YAW] = -move_y, move_x
         step[:, _X, _X_ICR], step[:, _Y, _X_ICR] = sideways * sine, -sideways * cosine
         # How much it lags by now is taken as known: to first order a longer lag misses so much more way.
         missed_m_s = x_icr * lags_rad_s * slides
         step[:, _X, _LATERAL_LAG], step[:, _Y, _LATERAL_LAG] = -missed_m_s * sine, missed_m_s * cosine
-        step[:, _X, _DRIVEN] = by_way * cosine[:, None] + by_turn * x_by_turn[:, None]
-        step[:, _Y, _DRIVEN] = by_way * sine[:, None] + by_turn * y_by_turn[:, None]
-        step[:, _YAW, _DRIVEN] = by_turn
+        for row, by_driven in (
+            (_X, by_way * cosine + by_turn * x_by_turn),
+            (_Y, by_way * sine + by_turn * y_by_turn),
+            (_YAW, by_turn),
+        ):
+            # Two slices: numpy takes twice as long to put numbers at a list of places.
+            step[:, row, _RADIUS : _AXLE + 1], step[:, row, _SLIPS] = by_driven[:2].T, by_driven[2:].T
         step[:, _X, _DRIFT_X] = step[:, _Y, _DRIFT_Y] = dt_s
         step[:, _LEFT, _LEFT] = step[:, _RIGHT, _RIGHT] = keep
 
@@ -159,9 +169,9 @@ class _Bank:
         noise[:, _AXLE] = (DRIFT_PER_SQRT_RAD * axle) ** 2 * np.abs(turn)
         noise[:, _X_ICR] = (DRIFT_PER_SQRT_RAD * np.maximum(np.abs(x_icr), SMALLEST_X_ICR * axle)) ** 2 * np.abs(turn)
         noise[:, _SLIPS] = SLIP_STD**2 * (1.0 - keep * keep)
-        noise[:, _DRIFTS] = self.on_slope[:, None] * DRIFT_WALK_M_S**2 * dt_s
+        noise[:, _DRIFT_X : _DRIFT_Y + 1] = self.on_slope[:, None] * DRIFT_WALK_M_S**2 * dt_s
         covariance = step @ self.covariance @ step.transpose(0, 2, 1)
-        covariance[:, _EVERY, _EVERY] += noise
+        _diagonals(covariance)[:] += noise
         across = np.stack([-sine, cosine], axis=1)
         covariance[:, :2, :2] += aside_m2[:, None, None] * across[:, :, None] * across[:, None, :]
         self.covariance = covariance

@@ -151,16 +151,21 @@ class _Wheel:
 
     def step(self, t_ns: int, dt_s: float, turned_rad: float, commands: Sequence[_Commanded]) -> None:
         """Take in by how much it was counted, and the commands that may be in force meanwhile."""
-        newest = commands[-1].slowest
-        smoothed = [each.smoothed for each in commands]
-        low, high = min(newest, *smoothed), max(newest, *smoothed)
+        low = high = newest = commands[-1].slowest
+        _, _, most, widened = commands[0]
+        # By comparisons, as the smallest of lists take twice as long, in every tick.
+        for _, smoothed, fastest, wider in commands:
+            if smoothed < low:
+                low = smoothed
+            elif smoothed > high:
+                high = smoothed
+            most = fastest if fastest > most else most
+            widened = wider if wider < widened else widened
         is_one_way = low >= 0.0 < high or low < 0.0 >= high
         if is_one_way:
             self.direction = 1.0 if high > 0.0 else -1.0
         least = max(low, -high, 0.0)
-        most = max(each.fastest for each in commands)
         progress = self.direction * turned_rad
-        widened = min(each.widened for each in commands)
         self._learn(dt_s, turned_rad, least, max(abs(low), abs(high)), abs(newest), widened)
         expected = max(least - max(self.loss_rad_s, -widened), 0.0) * dt_s
         self.beyond_rad = max(self.beyond_rad + abs(turned_rad) - (FASTER_PART * most + FASTER_RAD_S) * dt_s, 0.0)

@@ -90,7 +90,7 @@ def test_a_robot_that_is_tracked_at_its_centre_may_be_tracked_elsewhere_from_som
     wide, mean = 0.15 / np.sqrt(3.0) * np.array([NOMINAL[0], NOMINAL[1], 0.2]), np.array([*NOMINAL[:2], 0.0])
     found = GeometryFilter(mean, np.diag(wide**2), mean - 5.0 * wide, mean + 5.0 * wide)
     plant = ForeignPlant(ForeignRobot(*mean), (0.0, 0.0, 0.3), seed)
-    drive(found, plant, TURN, 20.0)
+    drive(found, plant, TURN, 12.0)
     assert found.mean[2] == pytest.approx(0.0, abs=0.004)
     assert (found.changes, found.on_slope) == (0, False)
     changed(plant, x_icr_m=0.05)
@@ -129,10 +129,10 @@ def test_a_robot_whose_belief_is_narrow_and_wrong_is_learnt():
 
 
 def test_beginning_and_ending_turns_is_no_change():
-    found, plant = settled(2)
+    found, plant = settled()
     for _ in range(3):
-        drive(found, plant, TURN[::-1], 4.0)
-        drive(found, plant, TURN, 4.0)
+        drive(found, plant, TURN[::-1], 2.0)
+        drive(found, plant, TURN, 2.0)
     assert found.changes == 0
     assert np.abs(found.mean / MEAN - 1.0).max() < 0.03
 
@@ -200,10 +200,11 @@ def test_ground_that_carries_the_robot_is_told_from_its_geometry_and_so_is_level
 
 
 @pytest.mark.parametrize("command", [TURN, pytest.param(STRAIGHT, marks=pytest.mark.thorough)])
-def test_level_ground_carries_nobody(command):
-    found, plant = settled(5)
-    for _ in range(50):
-        drive(found, plant, command, 0.4)
+@pytest.mark.parametrize("quarters", [40, pytest.param(80, marks=pytest.mark.thorough)])
+def test_level_ground_carries_nobody(command, quarters):
+    found, plant = settled()
+    for _ in range(quarters):
+        drive(found, plant, command, 0.25)
         assert not found.on_slope
     assert found.drift_m_s == (0.0, 0.0)
 
@@ -242,7 +243,7 @@ def test_a_pose_stamped_in_the_future_does_not_hold_up_those_after_it():
 
 
 def test_a_robot_that_stands_teaches_nothing():
-    found, plant = settled(1)
+    found, plant = settled()
     drive(found, plant, STANDSTILL, 2.0)
     before, covariance = found.mean, found.covariance
     drive(found, plant, STANDSTILL, 5.0)
@@ -252,7 +253,7 @@ def test_a_robot_that_stands_teaches_nothing():
 
 @pytest.mark.parametrize("minutes", [0.5, pytest.param(10.0, marks=pytest.mark.long)])
 def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minutes):
-    found, plant = settled(3)
+    found, plant = settled()
     before = found.mean
     for _ in range(round(2.0 * minutes)):
         drive(found, plant, STRAIGHT, 20.0)
@@ -261,7 +262,7 @@ def test_minutes_of_straight_lines_and_standing_leave_axle_and_x_icr_alone(minut
 
 
 def test_a_robot_that_was_carried_is_found_again():
-    found, plant = settled(1)
+    found, plant = settled()
     drive(found, plant, STANDSTILL, 2.0)
     known = found.covariance
     plant.state[:3] = 2.0, -1.0, -2.0

@@ -27,6 +27,7 @@ from disco_hw.tasks.circle import CircleCost
 from disco_hw.tasks.line import PathTable, Waypoints
 from disco_hw.tasks.line.cost import PathCost
 from disco_hw.tasks.timed_path import TimedPathCost
+from tests.tables import thinned
 
 LIMITS = CommandLimits(8.0, 20.0)
 SPEED_M_S, RADIUS_M, X_ICR_M = 0.2, 0.75, 0.2
@@ -78,7 +79,7 @@ def looked_up(terms, forward):
     return follow(terms, ZERO, ONE, ZERO, forward, FOUND)[1], row_of(terms, ZERO)
 
 
-@pytest.mark.parametrize("name", ["circle", "path"])
+@thinned("name", ["path", "circle"], quick=1)
 def test_a_cost_sees_the_robot_with_its_back_as_its_front(name):
     terms = prepared(name, round_the_circle())
     cos_yaw, sin_yaw, forward = np.float32(0.8), np.float32(0.6), np.float32(-0.15)

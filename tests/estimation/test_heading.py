@@ -15,7 +15,7 @@ from tests.estimation.truth import POSE_EVERY, Geometry, drives
 from tests.tables import thinned
 
 MOST_SEEDS = 40
-SEEDS = pytest.mark.parametrize("seeds", [20, pytest.param(MOST_SEEDS, marks=pytest.mark.thorough)])
+SEEDS = pytest.mark.parametrize("seeds", [12, pytest.param(MOST_SEEDS, marks=pytest.mark.thorough)])
 EVERY_NS = 200_000_000
 STD_M = 0.02
 NAN = math.nan

@@ -12,6 +12,7 @@ from disco_hw.estimation.correction import PoseReason
 from disco_hw.estimation.odometry import OdometryParameters
 from drivers.types import PoseSample
 from tests.estimation.truth import drives, pose_error
+from tests.tables import thinned
 
 DRIVE = drives(1, 8.0, speeds=lambda t: (4.0, 5.0))
 GEOMETRY = OdometryParameters(0.061, 0.415, 0.238)
@@ -152,7 +153,7 @@ def test_a_single_outlier_of_one_is_counted_and_changes_nothing():
 
 
 @pytest.mark.parametrize("liar", [FAST, SLOW])
-@pytest.mark.parametrize("m_s", [0.03, 0.1])
+@thinned("m_s", [0.03, 0.1], quick=1)
 def test_two_that_drift_apart_stop_as_nobody_knows_who_is_right(liar, m_s):
     def off(t):
         return (max(0.0, t - 2.0) * m_s, 0.0)

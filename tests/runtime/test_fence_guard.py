@@ -70,28 +70,26 @@ def integrated(
     seen: PoseEstimate, geometry: OdometryParameters, before, command, stops: StoppingSettings, response_s, longer
 ):
     """The end of the stopping path by small steps of what the module's docstring says, and the poses on the way."""
-    x, y, yaw = seen.x_m, seen.y_m, seen.yaw_rad
     before, command, dt = np.array(before), np.array(command), 1e-4
     excess = np.where(before * command < 0, before, np.where(abs(before) > abs(command), before - command, 0))
-    poses = [(x, y, yaw)]
+    poses = np.array([[seen.x_m, seen.y_m, seen.yaw_rad]])
 
     def drive(speeds, lasting_s, slowing):
-        nonlocal x, y, yaw
+        nonlocal poses
         steps = round(lasting_s / dt)
-        for k in range(steps):
-            left, right = speeds * (1 - (k + 0.5) / steps if slowing else 1.0)
-            v = longer * geometry.wheel_radius_m * (left + right) / 2
-            w = longer * geometry.wheel_radius_m * (right - left) / geometry.axial_distance_m
-            x += dt * (v * math.cos(yaw) + w * geometry.x_icr_m * math.sin(yaw))
-            y += dt * (v * math.sin(yaw) - w * geometry.x_icr_m * math.cos(yaw))
-            yaw += dt * w
-            poses.append((x, y, yaw))
+        parts = 1 - (np.arange(steps) + 0.5) / steps if slowing else np.ones(steps)
+        left, right = longer * geometry.wheel_radius_m * np.outer(speeds, parts)
+        v, w = (left + right) / 2, (right - left) / geometry.axial_distance_m
+        yaw = poses[-1, 2] + dt * (np.cumsum(w) - w)
+        x_m_s = v * np.cos(yaw) + w * geometry.x_icr_m * np.sin(yaw)
+        y_m_s = v * np.sin(yaw) - w * geometry.x_icr_m * np.cos(yaw)
+        poses = np.vstack([poses, poses[-1] + dt * np.cumsum(np.column_stack([x_m_s, y_m_s, w]), axis=0)])
 
     drive(before, response_s, slowing=False)
     drive(excess, abs(excess).max() / stops.deceleration_rad_s2, slowing=True)
     drive(command, 1.5 * stops.period_s + stops.reaction_s, slowing=False)
     drive(command, abs(command).max() / stops.deceleration_rad_s2, slowing=True)
-    return np.array(poses)
+    return poses
 
 
 @pytest.mark.parametrize("before", [(0.0, 0.0), (5.0, 5.0), (5.0, 2.0), (-4.0, 3.0)])

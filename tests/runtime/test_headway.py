@@ -83,7 +83,7 @@ def test_the_daemon_says_that_a_robot_stands_short_of_the_end_of_way_points_by_t
     law = LawController(lambda *_: (0.0, 0.0), setup.model, setup.config.task.planned(setup.config.control.mode))
     stack = simulated_stack(robot_file=robot_file, planner=law, start=BodyPose(0.23, 0.0, 0.0))
     start(stack, 0.02)
-    events = [event for tick in stack.run(7.5) for event in tick.events]
+    events = [event for tick in stack.run(7.2) for event in tick.events]
     assert [event.split(":")[1] for event in events if event.startswith("task:")] == [" no progress for 5 s"]
 
 
@@ -96,11 +96,11 @@ def started(**changes):
 def test_the_daemon_says_that_a_robot_stands_within_a_dead_band_that_its_model_does_not_know():
     setup = load_setup(ROBOT_FILE)
     law = LawController(lambda *_: (1.2, 1.2), setup.model, setup.config.task.planned(setup.config.control.mode))
-    events = [event for tick in started(planner=law, hide={"deadband": 1.3}).run(7.0) for event in tick.events]
+    events = [event for tick in started(planner=law, hide={"deadband": 1.3}).run(5.4) for event in tick.events]
     assert [event for event in events if event.startswith("task: no progress for 5 s: the wheels do not turn")]
 
 
 def test_wheels_that_stand_beyond_any_dead_band_stop_the_robot():
-    *_, tick = started(hide={"deadband": 20.0}).run(3.0)
+    *_, tick = started(hide={"deadband": 20.0}).run(1.5)
     assert tick.output.state is State.FAULT
     assert "although the wheel is commanded to turn" in tick.output.detail

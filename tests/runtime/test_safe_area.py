@@ -122,8 +122,7 @@ def test_a_hand_is_stopped_before_the_wall_and_may_leave_it(robot_file, tmp_path
     guards = recorded(run, records.GuardVerdict)
     assert {"free", "scaled", "stopped"} <= {one.verdict for one in guards}
     assert sum(bool(one.path_x_m) for one in guards) > len(guards) / 6
-    run.write_log(tmp_path / "run.mcap")
-    replayed(tmp_path / "run.mcap")
+    replayed(write_run(run, tmp_path / "run.mcap"))
 
 
 def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file):
@@ -147,22 +146,22 @@ def test_a_task_is_left_where_its_stopping_path_would_leave_the_fence(robot_file
 def test_without_a_pose_only_an_override_moves_the_robot(robot_file, tmp_path):
     run, hand = by_hand(robot_file, pose_dropout_probability=1.0)
     hand.wheels = (3.0, 3.0)
-    ticks = run.run(1.0)
+    ticks = run.run(0.5)
     assert all(tick.command.left_rad_s == 0.0 for tick in ticks)
     assert ticks[-1].pipeline.fence.reason == "no valid pose while a fence is set; check the pose sensor"
     assert run.core.area.task_fault == "fence: no valid pose while a fence is set; check the pose sensor"
     assert run.core.area.override(run.now_us * 1000, on=True) == "manual driving may leave the fence for 60 s"
-    ticks = run.run(1.0)
+    ticks = run.run(0.5)
     assert ticks[-1].command.left_rad_s == pytest.approx(3.0)
     assert events_of(ticks)[0].startswith("fence: OVERRIDDEN by the operator")
-    assert run.core.area.status(run.now_us * 1000)["overridden_s"] == pytest.approx(59.0, abs=0.1)
+    assert run.core.area.status(run.now_us * 1000)["overridden_s"] == pytest.approx(59.5, abs=0.1)
     assert any(one.overridden for one in recorded(run, records.GuardVerdict))
     # It is the hand's alone.
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0))
-    assert run.run(1.0)[-1].command.left_rad_s == 0.0
+    assert run.run(0.5)[-1].command.left_rad_s == 0.0
     run.pilot.step = lambda now_ns, last: PilotTick(motion=Manual(3.0, 3.0), by_hand=True)
     assert run.core.area.override(run.now_us * 1000, on=False) == "the fence is in force again"
-    assert run.run(1.0)[-1].command.left_rad_s == 0.0
+    assert run.run(0.5)[-1].command.left_rad_s == 0.0
     replayed(write_run(run, tmp_path / "run.mcap"))
 
 
@@ -353,7 +352,7 @@ def test_the_log_of_a_drive_round_the_edge_makes_its_fence(tmp_path):
     from disco_hw.first_use.fence_drive import fence_of_log, fence_toml
 
     run, hand = by_hand(SHIPPED_ROBOT)
-    hand.wheels = (1.0, 6.0)
+    hand.wheels = (1.0, 8.0)
     log = tmp_path / "edge.mcap"
     turned, before = 0.0, run.robot.truth.yaw_rad
     for _ in run.ticks(60.0):

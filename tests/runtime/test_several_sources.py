@@ -46,9 +46,9 @@ def bench(tmp_path):
 def test_both_are_fused_shown_recorded_and_replayed_bit_for_bit(bench, tmp_path):
     assert bench.start(1.0)
     bench.off_m = 0.6
-    bench.stack.run(1.5)
+    bench.stack.run(1.3)
     bench.senders[0].is_silent = True
-    last = bench.stack.run(1.5)[-1]
+    last = bench.stack.run(1.2)[-1]
     assert last.output.running
     now = status(bench.stack.core, {}, RecorderStats())["poses"]
     assert [one["source"] for one in now] == ["robot", "udp"]

@@ -179,7 +179,7 @@ def test_another_circle_is_driven_recorded_and_replayed_bit_for_bit(tmp_path):
     stack.run(1.5)
     stack.core.set_task(CircleTask(center_x_m=0.25, radius_m=0.5, speed_m_s=0.25))
     stack.run(0.5, UserRequest.ARM)
-    stack.run(3.6, UserRequest.START)
+    stack.run(2.4, UserRequest.START)
     stack.run(0.5, UserRequest.DISARM)
     assert [task_of(record, CircleTask()) for record in recorded(stack, records.Task)] == [stack.core.task]
     estimate = stack.core.last.pipeline.estimate

@@ -8,6 +8,7 @@ import pytest
 
 from disco_hw.control import PlannerState, PlanOutcome
 from disco_hw.tasks.line import SPACING_M, PathTable, Waypoints, sharp_turns
+from tests.tables import thinned
 from tests.tasks.costs import path_along
 from tests.tasks.drives import SPIN, begin_with, drive, planner_for, plant_at
 
@@ -61,7 +62,7 @@ def test_a_start_beside_the_path_joins_it():
 ROUND = Waypoints(np.column_stack([np.sin(ANGLE), 1.0 - np.cos(ANGLE)]))
 
 
-@pytest.mark.parametrize("trap", ["standing", "spinning"])
+@thinned("trap", ["spinning", "standing"], quick=1)
 def test_the_planner_leaves_the_traps(trap):
     task = path_along(ROUND, speed_m_s=0.2)
     plant, disco = plant_at(0.0, 0.0, 0.0), planner_for(task)
@@ -80,7 +81,7 @@ def test_a_round_path_is_driven_forwards():
     assert distance_to(ROUND, poses)[20:].mean() < 0.03
 
 
-@pytest.mark.parametrize("yaw_rad", [math.pi, -2.0])
+@thinned("yaw_rad", [math.pi, -2.0], quick=1)
 def test_a_robot_that_faces_the_wrong_way_turns_round(yaw_rad):
     poses, speeds, places = follow(path_along(ROUND, speed_m_s=0.25), 15.0, (0.0, 0.0, yaw_rad))
     assert speeds[60:].min() > -0.02

@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-import pytest
 
 from disco_hw.control import DiscoSettings
 from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.line.course import END_M
 from disco_hw.tasks.timed_path import TimedPathCost
+from tests.tables import thinned
 from tests.tasks.costs import instant_cost
 from tests.tasks.drives import SPIN, begin_with, drive, planner_for, plant_at
 
@@ -66,7 +66,7 @@ def test_the_heading_is_that_of_a_robot_that_stays_with_the_place():
     assert TimedPathCost(still).prepare(0.0, 0.0, 0.0, 0.0, None, 0.1, 40).terms.headings(x_icr_m) is None
 
 
-@pytest.mark.parametrize("trap", ["standing", "spinning"])
+@thinned("trap", ["spinning", "standing"], quick=1)
 def test_the_planner_leaves_the_traps(trap):
     task = TimedPathCost(FROM_START)
     plant, disco = plant_at(0.0, 0.0, 0.0), planner_for(task)
@@ -74,7 +74,7 @@ def test_the_planner_leaves_the_traps(trap):
     assert np.mean(followed(task, plant, disco, range(1, 151))[-50:]) < 0.08
 
 
-@pytest.mark.parametrize("yaw_rad", [0.0, math.pi])
+@thinned("yaw_rad", [math.pi, 0.0], quick=1)
 def test_it_is_followed_forwards(yaw_rad):
     task, plant = TimedPathCost(FROM_START), plant_at(0.0, 0.0, yaw_rad)
     speeds, off = [], []

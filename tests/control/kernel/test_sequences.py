@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -136,7 +135,7 @@ def test_weighted_sums_over_blocks_skip_what_came_before():
     np.testing.assert_allclose(sums[:, 0], expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("basis", [SPLINE, WHITE], ids=["spline", "white"])
+@thinned("basis", [SPLINE, WHITE], ids=["spline", "white"], quick=1)
 def test_the_mean_noise_over_time_comes_from_the_sums_of_its_rows(basis):
     noise, over_time, _ = drawn(basis, 7)
     rows = noise.size // B
