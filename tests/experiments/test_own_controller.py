@@ -53,6 +53,19 @@ def agree(documented, measured):
     np.testing.assert_allclose(measured, documented, rtol=0.1, atol=2.0)
 
 
+def test_the_pages_law_keeps_to_its_circle():
+    scope = {"__name__": "my_controller"}
+    exec(block("python", 0), scope)
+    drive = drive_virtual(ROBOT, scope["steer"], 6.0)
+    x, y = drive.poses[:, 0], drive.poses[:, 1]
+    away = np.abs(np.hypot(x, y) - 0.75)
+    # It swings off at first.
+    assert away[-1] < 0.5 * away.max() < 0.05
+    assert drive.laps == pytest.approx(np.ptp(np.unwrap(np.arctan2(y, x))) / (2.0 * math.pi), abs=0.02)
+    assert drive.speeds[-1] == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.thorough
 def test_the_pages_law_drives_the_circle_as_the_page_says():
     output = StringIO()
     with redirect_stdout(output):
