@@ -50,7 +50,7 @@ class Bench:
     def driving(self):
         self.run(0.5)
         assert self.stack.core.last.output.state is State.READY
-        self.run(1.5, held=True)
+        self.run(0.9, held=True)
         assert self.stack.robot.truth.right_speed_rad_s == pytest.approx(5.0, abs=0.3)
         return self
 

@@ -56,7 +56,7 @@ def test_drives_with_other_options_are_driven_anew(tmp_path, changes):
     assert other.result.rows()[0]["count"] == 2
 
 
-def test_the_table_counts_breaches_stops_and_ways(tmp_path):
+def test_the_table_counts_breaches_stops_and_ways(tmp_path, monkeypatch):
     driven = campaign(tmp_path)
     driven.gather("by hand", 3, Driver(), 0)
     driven.gather(f"{ALONE}point model", 4, Driver(-2.0), 1)
@@ -67,6 +67,22 @@ def test_the_table_counts_breaches_stops_and_ways(tmp_path):
     assert alone["way_median_m"] == 1.5
     assert "guard off: point model" in driven.result.table()
     driven.gather(f"{ALONE}{CORRIDOR}point model", 2, Driver(), 2)
+    figures = []
+    monkeypatch.setattr(fence, "write_pictures", lambda figure, _path: figures.append(figure))
+    driven.result.write_pictures(tmp_path / "fence.png")
+    ways = [[line.get_xdata() for line in axis.lines] for axis in figures[0].axes]
+    # A room with a way, then the drives of each group and the fence itself.
+    assert [len(lines) for lines in ways] == [2, 2, 2, 2]
+    np.testing.assert_allclose(
+        ways[2][0], np.sort([one.least_m for one in driven.result.drives[f"{ALONE}point model"]])
+    )
+    assert [len(lines[0]) for lines in ways[1:]] == [3, 4, 2]
+
+
+@pytest.mark.thorough
+def test_its_pictures_are_written(tmp_path):
+    driven = campaign(tmp_path)
+    driven.gather("by hand", 3, Driver(), 0)
     driven.result.write_pictures(tmp_path / "fence.png")
     assert (tmp_path / "fence.png").stat().st_size > 10_000
 

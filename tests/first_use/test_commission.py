@@ -31,17 +31,32 @@ from drivers.types import PoseSample, WheelSample
 from sim.devices import odrive
 from sim.plant_parameters import PlantParameters
 from tests.first_use.miswired import Miswiring, robot_file, stage
+from tests.tables import thinned
 
 DRIVERS = ("reference", "odrive", "vesc", "agilex", "roboclaw")
 FARTHEST_M = 0.3
-# Period of the controller in quick tests, which boards have five times as short.
-COARSE_US = 5000
+# Quick tests: a controller's turn, which boards have five times as short, and fewer poses.
+COARSE = {"step_us": 5000, "plant": PlantParameters(pose_rate_hz=10.0)}
 
 
 @pytest.fixture
 def path(tmp_path):
     """A robot.toml of the reference controller."""
     return robot_file(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory):
+    """The robot whose drive on the floor is made up."""
+    return load_setup(robot_file(tmp_path_factory.mktemp("shipped")))
+
+
+def coarse_file(directory, driver=None):
+    """The robot.toml of quick tests: fewer turns a second, and wheels that take less time for the same way."""
+    path = robot_file(directory, driver)
+    text = path.read_text("utf-8").replace("rate_hz = 50.0", "rate_hz = 20.0")
+    path.write_text(text.replace("max_wheel_speed_rad_s = 8.0", "max_wheel_speed_rad_s = 11.0"), "utf-8")
+    return path
 
 
 def in_millimetres(x, y, yaw):
@@ -124,7 +139,7 @@ def check_near(run, name):
     if name != "floor" or lags:
         return
     assert run.slow_rad_s <= MOST_SHARE * top
-    first = run.where[0][1]
+    first, period_s = run.where[0][1], 1.0 / run.core.config.control.rate_hz
     x, y, yaw, farthest = first.x_m, first.y_m, first.yaw_rad, 0.0
     for command, true in run.where:
         left, right = (0.0, 0.0) if command is None else (command.left_rad_s, command.right_rad_s)
@@ -132,20 +147,21 @@ def check_near(run, name):
         v = 0.5 * plant.wheel_radius_m * (left + right)
         w = plant.wheel_radius_m * (right - left) / plant.axial_distance_m
         slip = w * plant.x_icr_m
-        x += 0.02 * (v * math.cos(yaw) + slip * math.sin(yaw))
-        y += 0.02 * (v * math.sin(yaw) - slip * math.cos(yaw))
-        yaw += 0.02 * w
+        x += period_s * (v * math.cos(yaw) + slip * math.sin(yaw))
+        y += period_s * (v * math.sin(yaw) - slip * math.cos(yaw))
+        yaw += period_s * w
         farthest = max(farthest, math.hypot(true.x_m - x, true.y_m - y))
     assert farthest < FARTHEST_M
 
 
 @pytest.mark.parametrize(("name", "driver", "wrong"), FAST)
 def test_a_fault_is_found_named_and_mended(tmp_path, name, driver, wrong):
-    assert commissioned(robot_file(tmp_path, driver), WRONG[wrong], (name,), step_us=COARSE_US) == [wrong]
+    assert commissioned(coarse_file(tmp_path, driver), WRONG[wrong], (name,), **COARSE) == [wrong]
 
 
-def test_a_pose_wrong_in_every_way_is_mended_at_once(path):
-    evaluation, run = evaluated(path, "floor", Miswiring(pose=wrong_in_every_way), step_us=COARSE_US)
+def test_a_pose_wrong_in_every_way_is_mended_at_once(tmp_path):
+    path = coarse_file(tmp_path)
+    evaluation, run = evaluated(path, "floor", Miswiring(pose=wrong_in_every_way), **COARSE)
     check_near(run, "floor")
     assert write_fields(CommissionOptions(path, write=True), evaluation.edits)
     assert {fault.name for fault in evaluation.faults} == {
@@ -168,12 +184,16 @@ X_ICR_M, OFFSET, LATENCY_S = 0.12, (0.6, 0.2), 0.1
 PER_METRE, PER_RADIAN = {"m": 1.0, "cm": 100.0, "mm": 1000.0}, {"rad": 1.0, "deg": 180.0 / math.pi}
 VALUES = {"position_unit": PER_METRE, "yaw_unit": PER_RADIAN, "clockwise": (False, True), "mirrored": (False, True)}
 UNITS = [dict(zip(VALUES, units, strict=True)) for units in product(*VALUES.values())]
+# Each two values of two fields meet in one of these.
+FEW_UNITS = [UNITS[number] for number in (0, 7, 10, 13, 17, 22)]
+FEW_AND_ALL = pytest.mark.parametrize(
+    "all_units", [pytest.param(FEW_UNITS, id="few"), pytest.param(UNITS, id="all", marks=pytest.mark.thorough)]
+)
 PLACE = {"origin": (3.0, -2.0, 0.6), "offset": OFFSET, "latency_s": LATENCY_S}
 
 
-def with_pose(path, **fields):
+def with_pose(setup, **fields):
     """The robot with these fields in [pose]."""
-    setup = load_setup(path)
     pose = msgspec.structs.replace(setup.config.pose, source="robot", **fields)
     return replace(setup, config=msgspec.structs.replace(setup.config, pose=pose))
 
@@ -217,14 +237,16 @@ def floor_drive(true, written):
     return STAGES[-1].evaluate(FloorSeen(straight, turned_left, turned_right, leg(0.25, 0.1)), written)
 
 
-@pytest.mark.parametrize("yaw_offset_rad", [0.0, 2.0])
-@pytest.mark.parametrize("offset", [(0.0, 0.0), OFFSET])
-@pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), PLACE["origin"]])
-def test_a_right_robot_toml_is_right_in_all_units_and_axes(path, origin, offset, yaw_offset_rad):
+@thinned(
+    ("origin", "offset", "yaw_offset_rad"),
+    list(product([(0.0, 0.0, 0.0), PLACE["origin"]], [(0.0, 0.0), OFFSET], [0.0, 2.0])),
+    quick=2,
+)
+def test_a_right_robot_toml_is_right_in_all_units_and_axes(shipped, origin, offset, yaw_offset_rad):
     ahead_m = offset[0] - X_ICR_M
     for units in UNITS:
         place = {"origin": origin, "offset": offset, "latency_s": LATENCY_S}
-        right = with_pose(path, **units, **place, yaw_offset_rad=yaw_offset_rad)
+        right = with_pose(shipped, **units, **place, yaw_offset_rad=yaw_offset_rad)
         found = floor_drive(right, right)
         assert not found.faults, units
         assert (
@@ -236,25 +258,27 @@ def test_a_right_robot_toml_is_right_in_all_units_and_axes(path, origin, offset,
         assert len(found.figures) == 4
 
 
+@FEW_AND_ALL
 @pytest.mark.parametrize("name", [*VALUES, "yaw_offset_rad"])
-def test_a_wrong_field_is_named_with_the_value_that_is_right_beside_the_others(path, name):
-    for units in UNITS:
+def test_a_wrong_field_is_named_with_the_value_that_is_right_beside_the_others(shipped, name, all_units):
+    for units in all_units:
         fields = {**units, **PLACE, "yaw_offset_rad": 0.7}
         for wrong in {*VALUES.get(name, (2.0, -1.0))} - {fields[name]}:
-            found = floor_drive(with_pose(path, **fields), with_pose(path, **{**fields, name: wrong}))
+            found = floor_drive(with_pose(shipped, **fields), with_pose(shipped, **{**fields, name: wrong}))
             assert found.edits == pytest.approx({("pose", name): fields[name]}, abs=5e-3), (units, wrong)
 
 
-def test_all_wrong_fields_together_become_those_of_the_sensor(path):
-    for units in UNITS:
-        right, written = with_pose(path, **units, **PLACE, yaw_offset_rad=0.7), with_pose(path, **PLACE)
+@FEW_AND_ALL
+def test_all_wrong_fields_together_become_those_of_the_sensor(shipped, all_units):
+    for units in all_units:
+        right, written = with_pose(shipped, **units, **PLACE, yaw_offset_rad=0.7), with_pose(shipped, **PLACE)
         edits = {name: value for (_, name), value in floor_drive(right, written).edits.items()}
         assert edits.pop("yaw_offset_rad") == pytest.approx(0.7, abs=5e-3), units
         assert edits.items() == units.items() - UNITS[0].items()
 
 
-def test_a_yaw_offset_that_is_as_near_as_a_short_drive_shows_is_believed(path):
-    assert not floor_drive(with_pose(path, yaw_offset_rad=0.1), with_pose(path, yaw_offset_rad=0.25)).faults
+def test_a_yaw_offset_that_is_as_near_as_a_short_drive_shows_is_believed(shipped):
+    assert not floor_drive(with_pose(shipped, yaw_offset_rad=0.1), with_pose(shipped, yaw_offset_rad=0.25)).faults
 
 
 def test_a_fence_in_another_frame_than_that_of_the_poses_as_sent_is_not_in_force(tmp_path, path, monkeypatch, capsys):
@@ -300,8 +324,8 @@ def assert_driven_to_the_end(run):
 
 # The robot whose watchdog is off is on blocks, too.
 @pytest.mark.parametrize("name", ["sides", pytest.param("turns", marks=pytest.mark.thorough)])
-def test_a_robot_on_blocks_is_driven_to_the_end_though_its_poses_stand_still(path, name):
-    evaluation, run = evaluated(path, name, Miswiring(pose=lifted), step_us=COARSE_US)
+def test_a_robot_on_blocks_is_driven_to_the_end_though_its_poses_stand_still(tmp_path, name):
+    evaluation, run = evaluated(coarse_file(tmp_path), name, Miswiring(pose=lifted), **COARSE)
     assert not evaluation.faults
     assert_driven_to_the_end(run)
 
@@ -367,7 +391,7 @@ def test_an_e_stop_ends_a_stage_and_stays(tmp_path, monkeypatch, when):
 
     monkeypatch.setattr("tests.first_use.miswired.CommissionPilot", Pilot)
     with pytest.raises(WorkError, match=r"e-stop requested by the operator; correct it, then reset"):
-        stage(robot_file(tmp_path, driver), steps, Miswiring(pose=lifted), step_us=COARSE_US)
+        stage(coarse_file(tmp_path, driver), steps, Miswiring(pose=lifted), **COARSE)
     assert not resets
     # The daemon ends with it, so it must have arrived.
     assert outputs[-1].estop
@@ -375,9 +399,8 @@ def test_an_e_stop_ends_a_stage_and_stays(tmp_path, monkeypatch, when):
 
 
 def test_a_watchdog_that_is_off_is_named(tmp_path, monkeypatch):
-    path = robot_file(tmp_path, "odrive")
     monkeypatch.setattr(odrive.Axis, "check_watchdog", lambda *_args: None)
-    evaluation, run = evaluated(path, "turns", Miswiring(pose=lifted), step_us=COARSE_US)
+    evaluation, run = evaluated(coarse_file(tmp_path, "odrive"), "turns", Miswiring(pose=lifted), **COARSE)
     assert [fault.name for fault in evaluation.faults] == ["watchdog off"]
     assert_driven_to_the_end(run)
 

@@ -40,7 +40,7 @@ def test_a_good_posterior_is_calibrated(fitted):
 
 
 def test_an_overconfident_one_is_found_out(fitted):
-    found = calibrate(replace(fitted, network=Narrower(fitted.network, 2.0)), simulate, 300, 2)
+    found = calibrate(replace(fitted, network=Narrower(fitted.network, 2.0)), simulate, 150, 2)
     assert found.p_values.max() < 0.001
     assert found.coverage[LEVELS.index(0.9)] < 0.6
 

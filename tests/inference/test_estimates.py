@@ -9,8 +9,9 @@ from disco_hw.model import Model
 from tests.inference.drives import THETA, logged
 
 
-def test_a_noiseless_log_gives_the_true_parameters():
-    drive = excitation(logged("rich", noiseless=True))
+@pytest.mark.parametrize("name", ["poor", pytest.param("rich", marks=pytest.mark.thorough)])
+def test_a_noiseless_log_gives_the_true_parameters(name):
+    drive = excitation(logged(name, noiseless=True))
     found = estimates(drive, USUAL).theta(drive.pose[None])[0]
     assert found == pytest.approx(THETA, abs=2e-3)
     assert found[1:] == pytest.approx(THETA[1:], rel=2e-3)

@@ -47,12 +47,16 @@ def robot(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def inferred(robot):
+def circle(robot):
+    return write_log(robot.parent / "circle.csv")
+
+
+@pytest.fixture(scope="module")
+def inferred(circle, robot):
     folder = robot.parent
-    log = write_log(folder / "circle.csv")
     progress = []
     result = infer_command(
-        [log],
+        [circle],
         robot,
         folder / "model.toml",
         folder / "report.html",
@@ -182,10 +186,10 @@ def test_the_text_names_every_parameter_and_progress_is_told(inferred):
 
 
 @pytest.fixture
-def known(result, monkeypatch, tmp_path):
-    """A log; the inference is that of the circle, whatever the log."""
+def known(circle, result, monkeypatch):
+    """A log whose inference is known."""
     monkeypatch.setattr(verb, "infer", lambda *_: result.inference)
-    return write_log(tmp_path / "log.csv", "poor")
+    return circle
 
 
 @pytest.mark.thorough
@@ -244,16 +248,14 @@ def test_a_model_that_cannot_be_written_is_an_error_of_the_work(known, robot, tm
         infer_command([known], robot, tmp_path / "file" / "model.toml", options=FEW, search=in_the_way)
 
 
-def test_nothing_that_is_read_is_written_over(robot, tmp_path):
-    log = write_log(tmp_path / "circle.csv")
-    before = log.read_bytes(), robot.read_bytes()
-    for out, report in ((log, None), (robot, None), (None, log), (tmp_path / "new", tmp_path / "new")):
+def test_nothing_that_is_read_is_written_over(circle, robot, tmp_path):
+    before = circle.read_bytes(), robot.read_bytes()
+    for out, report in ((circle, None), (robot, None), (None, circle), (tmp_path / "new", tmp_path / "new")):
         with pytest.raises(InputError, match="is read here and would be overwritten; give another path"):
-            infer_command([log], robot, out, report, FEW, search=finds())
-    assert (log.read_bytes(), robot.read_bytes()) == before
+            infer_command([circle], robot, out, report, FEW, search=finds())
+    assert (circle.read_bytes(), robot.read_bytes()) == before
 
 
-def test_a_file_that_cannot_be_written_is_told_before_the_work(robot, tmp_path):
-    log = write_log(tmp_path / "circle.csv")
+def test_a_file_that_cannot_be_written_is_told_before_the_work(circle, robot):
     with pytest.raises(InputError, match=r"circle\.csv is not a directory; give another path"):
-        infer_command([log], robot, log / "model.toml", options=FEW, search=finds())
+        infer_command([circle], robot, circle / "model.toml", options=FEW, search=finds())

@@ -23,14 +23,14 @@ def circle():
 
 
 def test_it_is_the_scatter_of_what_is_measured_on_other_drives_like_it(circle):
-    seeds = draw_seeds(40, np.random.default_rng(9))
+    seeds = draw_seeds(24, np.random.default_rng(9))
     poses = circle.poses(np.tile(THETA, (seeds.size, 1)), seeds)
     fits = estimates(circle.drive, TRUE).theta(poses)
     logs = [
         np.log(measured_noise(replace(circle.drive, pose=pose), fit).scales()[:5] / TRUE.scales()[:5])
         for pose, fit in zip(poses, fits, strict=True)
     ]
-    known = noise_spread(circle, THETA, 1, repeats=40)
+    known = noise_spread(circle, THETA, 1, repeats=24)
     predicted_std = np.sqrt(np.diag(known.factor @ known.factor.T))
     assert predicted_std[:5] == pytest.approx(np.std(logs, axis=0), rel=0.4)
     # The slip of one minute is told several times worse than the sensor's noise.

@@ -22,14 +22,14 @@ def observed(truth):
 
 def test_rounds_close_in_on_a_posterior_far_narrower_than_the_prior():
     truth = np.array([0.6, 0.3])
-    fitted = run_rounds(simulate, observed(truth), PRIOR, 1200, SETTINGS, 1)
+    fitted = run_rounds(simulate, observed(truth), PRIOR, 800, SETTINGS, 1)
     draws, outside = fitted.draw(observed(truth)[None], 4000, np.random.default_rng(0))
     jacobian = np.array([[1.2, 0.0], [1.0, 1.0]])
     exact = SD * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian)))
     assert draws[0].mean(axis=0) == pytest.approx(truth, abs=1.5 * SD)
     assert draws[0].std(axis=0) == pytest.approx(exact, rel=0.35)
     assert outside[0] < 0.02
-    assert fitted.simulations == 1200
+    assert fitted.simulations == 800
 
 
 @pytest.mark.thorough

@@ -1,10 +1,12 @@
 """Pictures, clips and exported pages of a log, and the pages as processes."""
 
 import json
+import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import urllib.request
 
 import numpy as np
@@ -13,7 +15,7 @@ from PIL import Image
 
 from disco_hw.cli.logs import view
 from disco_hw.errors import InputError
-from disco_hw.viewer import picture, scene
+from disco_hw.viewer import commands, picture, scene
 from disco_hw.viewer.commands import export_log, in_figures, snapshot_log, video_log
 from tests.tables import thinned
 from tests.viewer.test_picture import count
@@ -115,7 +117,37 @@ def test_a_clip_without_end_is_refused(recording, tmp_path, monkeypatch):
         picture.draw_clip(recording, tmp_path / "a.gif", 1.0, lambda part: None)
 
 
-def test_a_page_is_served_until_it_is_told_to_end(log_file):
+def status_of(page):
+    """What a page answers a browser: its address carries the token, a cookie keeps it."""
+    browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+    with browser.open(page, timeout=60) as response:
+        return response.status
+
+
+def test_a_page_is_served_until_it_is_told_to_end(log_file, monkeypatch, capsys):
+    statuses, print_served = [], commands._print_served
+
+    def visit(page):
+        try:
+            statuses.append(status_of(page))
+        finally:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def printed(report, as_json):
+        print_served(report, as_json)
+        threading.Thread(target=visit, args=[report["page"]]).start()
+
+    monkeypatch.setattr(commands, "_print_served", printed)
+    assert commands.view_log(log_file, port=0, as_json=True) == 0
+    assert statuses == [200]
+    report = json.loads(capsys.readouterr().out)
+    assert report["ticks"] == 200
+    with pytest.raises(OSError, match=r"refused|closed"):
+        status_of(report["page"])
+
+
+@pytest.mark.thorough
+def test_the_process_of_a_page_ends_when_it_is_told_to(log_file):
     code = "import sys; from pathlib import Path; from disco_hw.viewer.commands import view_log\n"
     code += f"sys.exit(view_log(Path({str(log_file)!r}), port=0, as_json=True))"
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
@@ -123,10 +155,7 @@ def test_a_page_is_served_until_it_is_told_to_end(log_file):
         line = process.stdout.readline()
         report = json.loads(line)
         assert report["ticks"] == 200
-        # As a browser does: the address carries the token, a cookie keeps it.
-        browser = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-        with browser.open(report["page"], timeout=60) as response:
-            assert response.status == 200
+        assert status_of(report["page"]) == 200
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
         assert process.stdout.read() == ""

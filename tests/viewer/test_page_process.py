@@ -61,6 +61,16 @@ def test_the_page_ends_when_its_parent_is_killed():
     wait_until(lambda: state_of(pid) in {"", "Z"}, 60.0)
 
 
+def test_a_page_that_ends_by_itself_is_reported_and_not_started_again():
+    page = slim_page("raise SystemExit(2)")
+    try:
+        assert page.wait(60) == 2
+        assert page.new_messages() == ("the page ended with exit code 2; start it again with `disco-hw view`",)
+    finally:
+        page.close()
+
+
+@pytest.mark.thorough
 def test_a_page_that_cannot_start_is_reported_and_not_started_again(tmp_path, capfd):
     with page_in_background(tmp_path / "none.toml", None, "127.0.0.1", 0) as page:
         assert page.wait(60) == 2

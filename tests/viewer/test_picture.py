@@ -59,13 +59,22 @@ def test_an_export_to_where_nothing_can_be_written_is_told(recording, tmp_path):
         picture.export_html(recording, tmp_path / "none" / "run.html", lambda part: None)
 
 
-def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(picture, "_PICTURE_DPI", 40)
-    before, start = (pixels_of(recording, t_s, tmp_path / "a.png") for t_s in (-5.0, 0.0))
-    after, end = (pixels_of(recording, t_s, tmp_path / "a.png") for t_s in (1e6, recording.duration_s))
-    assert (before == start).all()
-    assert (after == end).all()
-    assert np.abs(start - end).max() > 100
+def drawn(recording, t_s):
+    """Titles, lines and areas of a picture."""
+    figure = picture._figure()
+    picture._draw(figure, recording, t_s)
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    lines = [line.get_xydata() for axes in figure.axes for line in axes.get_lines()]
+    areas = [patch.get_verts() for axes in figure.axes for patch in axes.patches]
+    return titles, np.concatenate(lines), np.concatenate(areas)
+
+
+def test_an_instant_before_the_log_and_one_after_it_are_its_ends(recording):
+    for outside_s, end_s in ((-5.0, 0.0), (1e6, recording.duration_s)):
+        for beyond, at_end in zip(drawn(recording, outside_s), drawn(recording, end_s), strict=True):
+            np.testing.assert_array_equal(beyond, at_end)
+    (start, *_), (end, *_) = drawn(recording, 0.0), drawn(recording, recording.duration_s)
+    assert start != end
 
 
 def test_a_clip_has_ten_pictures_a_second_and_tells_how_far_it_is(recording, tmp_path):

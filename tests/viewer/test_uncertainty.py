@@ -1,3 +1,4 @@
+import msgspec
 import numpy as np
 import pytest
 
@@ -29,10 +30,29 @@ def test_paths_are_those_of_the_compiled_model():
         assert np.abs(path - expected).max() < 1e-9
 
 
+def remembering(**terms):
+    """A robot whose commands count less after much driving, or whose turning does when it changes."""
+    names = {"load": "command += k u mean_1s(|u| + |u_other|)", "turn": "omega += k (omega - mean_1s(omega))"}
+    return Model(0.06, 0.3, 0.1, tuple(EffectSetting(names[name], {"k": k}) for name, k in terms.items()))
+
+
+def test_what_a_robot_has_done_for_long_changes_nothing_more():
+    plan = plan_at(0)
+    left, right = plan.left_rad_s[0], plan.right_rad_s[0]
+    plain = ParameterPoints(remembering())
+    share = 1.0 - 0.02 * (left + right)
+    less = msgspec.structs.replace(plan, left_rad_s=(share * left,) * 10, right_rad_s=(share * right,) * 10)
+    loaded = ParameterPoints(remembering(load=-0.02)).trajectories(plan, (left, right))
+    np.testing.assert_allclose(loaded, plain.trajectories(less, (left, right)), atol=1e-9)
+    turning, before = ParameterPoints(remembering(turn=-0.5)), plain.trajectories(plan, (left, right))
+    np.testing.assert_allclose(turning.trajectories(plan, (left, right)), before, atol=1e-9)
+    assert np.abs(turning.trajectories(plan, (0.0, 0.0)) - before).max() > 1e-3
+
+
+# For its effects alone a function is compiled.
+@pytest.mark.thorough
 def test_a_robot_that_remembers_is_taken_to_have_done_the_same_before():
-    terms = {"command += k u mean_1s(|u| + |u_other|)": -0.02, "omega += k (omega - mean_1s(omega))": -0.5}
-    effects = tuple(EffectSetting(name, {"k": k}) for name, k in terms.items())
-    model, plan = Model(0.06, 0.3, 0.1, effects), plan_at(0)
+    model, plan = remembering(load=-0.02, turn=-0.5), plan_at(0)
     (path,) = ParameterPoints(model).trajectories(plan, (1.0, 2.0))
     start, commands = start_and_commands(plan)
     load = np.abs(commands[0]).sum()
