@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -112,19 +113,26 @@ class Maker:
         return self.create("sensor_msgs/msg/Image", *fields)
 
 
+@cache
+def typestore(distro):
+    """The types of a release of ROS; to write the code that reads and writes them takes longer than a small bag."""
+    store = get_typestore(distro)
+    if distro is Stores.ROS1_NOETIC:
+        tf = "tf2_msgs/msg/TFMessage"
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf))
+    return store
+
+
 @contextmanager
 def bag(path, storage="mcap", distro=Stores.ROS2_HUMBLE, version=9):
     """A maker for a bag at this path."""
     if storage == "ros1":
         with Writer1(path) as writer:
-            store = get_typestore(Stores.ROS1_NOETIC)
-            tf = "tf2_msgs/msg/TFMessage"
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf))
-            yield Maker(writer, store, True)
+            yield Maker(writer, typestore(Stores.ROS1_NOETIC), True)
         return
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer2(path, version=version, storage_plugin=plugin) as writer:
-        yield Maker(writer, get_typestore(distro), False)
+        yield Maker(writer, typestore(distro), False)
 
 
 def config(**ros2):
