@@ -9,6 +9,7 @@ base64. Logs of before have those strings in the fields themselves, and are read
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any, TypeVar, get_type_hints
 
 import msgspec
@@ -112,6 +113,7 @@ def _within_64_bits(record: _R) -> _R:
     return record
 
 
+@cache
 def json_schema(record_type: type[Record]) -> bytes:
     """Return the JSON schema of a record type in the plain form that viewers read.
 

@@ -194,8 +194,12 @@ def fit_body(
     axial_m: float,
     factors: tuple[float, float] = (1.0, 1.0),
     mirrored: bool = False,
+    below: float = math.inf,
 ) -> BodyFit | None:
-    """Fit poses to the wheels' roll times `factors`, positions `mirrored` if told; None if too little is known."""
+    """Fit poses to the wheels' roll times `factors`, positions `mirrored` if told; None if too little is known.
+
+    None as well where the turning alone shows that `worst` would not be `below`.
+    """
     known = np.isfinite(windows.rolled_rad).all(axis=1) & np.isfinite(windows.turned_rad)
     known &= np.abs(np.nan_to_num(windows.rolled_rad)).max(axis=1) > MOVING_RAD
     if np.count_nonzero(known) < FEWEST_WINDOWS:
@@ -205,7 +209,12 @@ def fit_body(
     rolled = 0.5 * (left + right)
     turned, heading, way = windows.turned_rad[known], windows.heading_rad[known], windows.moved_m[known]
     turning = np.abs(nominal_turn) > TURNING_RAD
+    # Windows overlap by three quarters.
+    enough_turn = 0.25 * float(np.abs(nominal_turn).sum()) > _LEAST_TURNED_RAD
+    enough_way = 0.25 * float(np.abs(rolled).sum()) > _LEAST_ROLLED_RAD
     kappa, turn_unexplained = fit_robustly(nominal_turn[:, None], turned)
+    if enough_turn and turn_unexplained >= below:
+        return None
     # What the robot's centre of rotation, or the sensor's place on it, adds where it turns is fitted beside; on a
     # steady circle it cannot be told from the rest, and the added row decides for none.
     ahead, lever = radius_m * rolled, 1j * nominal_turn
@@ -213,9 +222,6 @@ def fit_body(
     columns = np.vstack([np.column_stack([ahead, lever]), row]).astype(np.complex128)
     body_way = (np.conj(way) if mirrored else way) * np.exp(-1j * heading)
     gain, way_unexplained = fit_robustly(columns, np.append(body_way, 0.0))
-    # Windows overlap by three quarters.
-    enough_turn = 0.25 * float(np.abs(nominal_turn).sum()) > _LEAST_TURNED_RAD
-    enough_way = 0.25 * float(np.abs(rolled).sum()) > _LEAST_ROLLED_RAD
     return BodyFit(
         float(kappa[0].real),
         float(np.median(np.abs(turned[turning])) / np.median(np.abs(nominal_turn[turning]))) if turning.any() else 0.0,
@@ -282,7 +288,9 @@ def fit_pose_clock(log: DriveLog, radius_m: float, axial_m: float, only_offset: 
         most = round((_LONGEST_SHIFT_S if rate == 1.0 else _LONGEST_SHIFT_OF_RATES_S) / STEP_S)
         for steps in range(-most, most + 1):
             moved = _shifted(windows, steps)
-            fit = None if moved is None else fit_body(moved, radius_m, axial_m)
+            # Of hundreds of fits few are better than all before: that turning shows spares most of the costlier rest.
+            below = math.inf if best is None else best.fit.worst
+            fit = None if moved is None else fit_body(moved, radius_m, axial_m, below=below)
             if fit is not None and fit.turn_unexplained is not None and (best is None or fit.worst < best.fit.worst):
                 best = ClockFit(steps * STEP_S, 1.0 / rate, fit)
     return best

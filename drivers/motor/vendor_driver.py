@@ -223,7 +223,12 @@ class VendorDriver:
         self._port = port
         self._table = table
         self._permit = MotionPermit(idle=table.idle, after_loss=table.after_loss, stage=table.idle)
-        self.stats = DriverStats()
+        self._counts = {field.name: 0 for field in dataclasses.fields(DriverStats)}
+
+    @property
+    def stats(self) -> DriverStats:
+        """A snapshot of the counters."""
+        return DriverStats(**self._counts)
 
     @property
     def state(self) -> DriverState:
@@ -424,4 +429,4 @@ class VendorDriver:
         self._port.reset_state(now_ns)
 
     def _count(self, name: str) -> None:
-        self.stats = dataclasses.replace(self.stats, **{name: getattr(self.stats, name) + 1})
+        self._counts[name] += 1

@@ -66,6 +66,8 @@ class InProcessTransport:
 
     def receive(self) -> Sequence[ReceivedFrame]:
         """Return all frames received since the last call, oldest first."""
+        if not self._incoming:
+            return ()
         received = tuple(self._incoming)
         self._incoming.clear()
         return received

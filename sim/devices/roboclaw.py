@@ -239,11 +239,11 @@ class RoboclawController:
     def wheels_rad_s(self) -> tuple[float | None, float | None]:
         """The mean of what a side's motors hold; None where one is released."""
         known_speeds: list[float | None] = []
+        counts_per_rad = self._settings.counts_per_rad
         for side, direction in zip(self._sides, self._settings.direction, strict=True):
-            speeds = [self._ramped.get(place) for place in side]
-            known = [speed for speed in speeds if speed is not None]
-            mean = direction * sum(known) / len(side) / self._settings.counts_per_rad
-            known_speeds.append(mean if len(known) == len(side) else None)
+            known = [self._ramped[place] for place in side if place in self._ramped]
+            is_known = len(known) == len(side)
+            known_speeds.append(direction * sum(known) / len(side) / counts_per_rad if is_known else None)
         return known_speeds[0], known_speeds[1]
 
     @property
@@ -284,16 +284,20 @@ class RoboclawController:
         """Go through one millisecond: the encoders count, timeouts run, speeds are ramped."""
         self._ticks = (inputs.left_ticks, inputs.right_ticks)
         self._measured = (inputs.left_speed_rad_s, inputs.right_speed_rad_s)
+        counts_per_rad = self._settings.counts_per_rad
         for number, (side, direction) in enumerate(zip(self._sides, self._settings.direction, strict=True)):
             ticks = self._ticks[number] - self._zero_ticks[number]
             count = round(direction * ticks * self._counts_per_tick)
-            speed = direction * self._measured[number] * self._settings.counts_per_rad
+            speed = direction * self._measured[number] * counts_per_rad
             self._counted[number].append(count)
+            # In steps of 300 counts/s: what was counted in the last 1/300 s, as long as three steps and a little.
+            counts_s = 300 * (count - self._counted[number][0])
             for address, motor in side:
                 registers = self.boards[address].registers
-                setattr(registers, f"encoder_m{motor + 1}", count)
-                # In steps of 300 counts/s: what was counted in the last 1/300 s, as long as three steps and a little.
-                setattr(registers, f"speed_m{motor + 1}", 300 * (count - self._counted[number][0]))
+                if motor == 0:
+                    registers.encoder_m1, registers.speed_m1 = count, counts_s
+                else:
+                    registers.encoder_m2, registers.speed_m2 = count, counts_s
                 self._ramp(address, motor, speed)
         for board in self.boards.values():
             if inputs.estop_button:

@@ -40,7 +40,8 @@ def live(tmp_path):
 
     def serve():
         now_ns = 0
-        while not ended.is_set():
+        # Without a pause it would take the processor from the client.
+        while not ended.wait(0.001):
             now_ns += 1
             feed.put(now_ns, [ESTIMATE, Event(now_ns, "info", "a", "b"), DaemonState(now_ns, "READY", "READY")])
             served.step()

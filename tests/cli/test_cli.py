@@ -7,14 +7,18 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from importlib import metadata
+from unittest import mock
 
 import click
 import pytest
+import typer.main
+from click.testing import CliRunner
 from rich.markup import render
 from typer.main import get_command
-from typer.testing import CliRunner
 
+from disco_hw import cli
 from disco_hw.cli import app, plain_stop
 from disco_hw.daemon import emergency
 from disco_hw.errors import InputError
@@ -25,6 +29,16 @@ VERBS = [
     *("demo", "run", "sim", "drive", "ctl", "check", "replay", "estop"),
     *("infer", "gap", "view", "import", "experiment", "log"),
 ]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _made_once():
+    # Of a call's time the command's own making is nine tenths, and the same each time.
+    with (
+        mock.patch.object(cli, "app", cache(cli.app)),
+        mock.patch("typer.main.get_command", cache(typer.main.get_command)),
+    ):
+        yield
 
 
 def disco(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -51,7 +65,7 @@ def help_texts(command: click.Command) -> Iterator[str]:
 
 
 def test_no_help_text_loses_a_bracketed_word():
-    texts = list(help_texts(get_command(app())))
+    texts = list(help_texts(typer.main.get_command(cli.app())))
     assert len(texts) > 100
     for text in texts:
         assert render(text).plain == text
@@ -115,7 +129,7 @@ def test_an_infinite_option_is_refused_unless_it_is_the_default():
     assert disco_here("experiment", "fence", "--seconds", "inf") == (
         2, "disco-hw: --seconds inf: not a finite number; write one\n"
     )  # fmt: skip
-    circle = get_command(app()).commands["experiment"].commands["circle"]
+    circle = typer.main.get_command(cli.app()).commands["experiment"].commands["circle"]
     for arguments in ([], ["--largest-rot-s2", "inf"]):
         assert circle.make_context("", arguments).params["largest_rot_s2"] == math.inf
 
@@ -182,7 +196,7 @@ def test_verbs_and_options_are_completed_and_nothing_heavy_is_loaded_for_it():
 def test_a_stop_that_goes_past_the_library_is_read_as_the_library_reads_it(monkeypatch, arguments):
     calls = []
     monkeypatch.setattr(emergency, "stop_and_report", lambda *given: calls.append(given) or 0)
-    result = CliRunner().invoke(app(), ["estop", *arguments.split()])
+    result = CliRunner().invoke(typer.main.get_command(cli.app()), ["estop", *arguments.split()])
     plain = plain_stop(["estop", *arguments.split()])
     assert plain is None or calls == [plain]
     # What the library refuses, explains or reads in a way of its own is left to it.

@@ -112,7 +112,7 @@ def test_good_files_get_as_far_as_the_work(tmp_path, calling, one):
 @thinned(
     ("one", "name", "kind"),
     CASES,
-    quick=len(CASES) // 4,
+    quick=len(CASES) // 6,
     ids=lambda value: value if isinstance(value, str) else value.verb,
 )
 def test_what_is_no_file_is_refused_in_one_line_that_names_it(tmp_path, calling, one, name, kind):

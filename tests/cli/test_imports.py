@@ -87,7 +87,7 @@ def test_a_daemon_is_asked_whatever_has_become_of_the_task_in_the_file_but_not_w
         ["infer", "{none}", "--robot", "{robot}"], ["gap", "{none}", "--robot", "{robot}", "-o", "out"],
         ["log", "info", "{none}"], ["log", "recover", "{none}", "-o", "out"], ["log", "export", "{none}", "-o", "out"],
         ["import", "{none}", "--robot", "{robot}", "-o", "out"],
-    ], quick=3,
+    ], quick=2,
     ids=" ".join,
 )  # fmt: skip
 def test_a_missing_file_is_refused_before_anything_heavy_is_loaded(robot, tmp_path, verb):

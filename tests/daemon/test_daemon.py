@@ -105,12 +105,21 @@ class Driven:
             self.sleep_until_ns(self._now_ns + 20 * MS)
         return tick
 
+    def run_until(self, reached, *requests):
+        tick = self.run(0.02, *requests)
+        for _ in range(200):
+            if reached(tick):
+                break
+            tick = self.run(0.02)
+        return tick
+
     def drive(self):
-        self.run(1.0)
-        self.run(1.0, UserRequest.ARM)
-        tick = self.run(3.5, UserRequest.START)
+        self.run_until(lambda tick: tick.output.state is State.READY)
+        self.run_until(lambda tick: tick.output.state is State.ARMED, UserRequest.ARM)
+        full_speed_rad_s = pytest.approx(self.motion.left_rad_s, rel=0.02)
+        tick = self.run_until(lambda _tick: self.rig.speed_rad_s == full_speed_rad_s, UserRequest.START)
         assert (tick.output.state, tick.output.running) == (State.ARMED, True), tick.output.detail
-        assert self.rig.speed_rad_s == pytest.approx(self.motion.left_rad_s, rel=0.02)
+        assert self.rig.speed_rad_s == full_speed_rad_s
 
 
 @pytest.fixture(params=SPEEDS_RAD_S)
@@ -119,9 +128,9 @@ def name(request):
 
 
 def test_after_a_suspend_of_this_computer_the_robot_does_not_drive_on(tmp_path, name):
-    driven = Driven(tmp_path, name)
+    driven = Driven(tmp_path, name, coasting_s=0.2)
     driven.drive()
-    driven.suspend(20.0)
+    driven.suspend(3.0)
     driven.daemon._suspend_watch = SimpleNamespace(was_suspended=[*(50 * [False]), True].pop)
     fastest_rad_s = driven.rig.speed_rad_s
     for _ in range(50):

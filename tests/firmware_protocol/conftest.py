@@ -24,6 +24,6 @@ def compiled_core(tmp_path_factory):
     )
     sanitizers = () if tried.returncode else HARNESS_SANITIZERS
     firmware = PACKAGE / "firmware"
-    flags = ("-std=c99", "-O1", "-g1", "-Wall", "-Wextra", "-Werror", f"-I{firmware}", *sanitizers)
+    flags = ("-std=c99", "-O0", "-g1", "-Wall", "-Wextra", "-Werror", f"-I{firmware}", *sanitizers)
     subprocess.run(["cc", *flags, "-c", *(str(firmware / name) for name in SOURCES)], cwd=folder, check=True)
     return flags, sorted(map(str, folder.glob("*.o")))

@@ -58,7 +58,23 @@ class TestAuthenticatedCore(TestCore):
     key = bytes(range(16))
 
 
-class TestSlowCore(TestAuthenticatedCore):
-    """A robot that can go at less than the suite's 1.5 rad/s, and takes its time to."""
+SLOW = replace(CONFIG, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)
+"""A robot that can go at less than the suite's 1.5 rad/s, and takes its time to."""
 
-    core = replace(CONFIG, max_wheel_speed_rad_s=1.0, max_wheel_acceleration_rad_s2=0.5)
+
+@pytest.mark.thorough
+class TestSlowCore(TestAuthenticatedCore):
+    core = SLOW
+
+
+def test_a_slow_robot_conforms():
+    suite = FirmwareConformance()
+
+    def new_host():
+        host = ProtocolHost(SimulatedEnd(ReferenceRobot(SLOW)))
+        host.settle()
+        return host
+
+    suite.test_armed_it_stands_until_told_and_then_follows(new_host())
+    host = new_host()
+    suite.test_the_host_can_end_it(host, host.end.slack_s, {"request": "STANDBY"}, "REQUESTED")

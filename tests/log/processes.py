@@ -13,29 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from disco_hw.log import writer
-from disco_hw.log.process_recorder import RecordingSettings
+from disco_hw.log import writer, writer_link
+from disco_hw.log.process_recorder import ProcessRecorder, RecordingSettings
 from disco_hw.log.reader import open_log
 from tests.drivers import waiting
 from tools.log_samples import ATTACHMENTS, tick
-
-_RECORD = """
-import sys, time
-from pathlib import Path
-from disco_hw.log import writer
-from disco_hw.log.process_recorder import ProcessRecorder
-from tests.log.processes import recording
-from tools.log_samples import tick
-recorder = ProcessRecorder(recording(Path(sys.argv[1])))
-print(recorder.writer_pid, recorder.keeper_pid, flush=True)
-first, last = int(sys.argv[2]), int(sys.argv[3])
-for k in range(1, 100_000):
-    now_ns = time.monotonic_ns()
-    recorder.put(now_ns, tick(k, now_ns)[first:last])
-    recorder.poll()
-    print(k, flush=True)
-    time.sleep(0.005)
-"""
 
 
 def recording(path, **changes):
@@ -84,26 +66,21 @@ def drive(recorder, first, count, period_s=0.0):
     return times
 
 
-class ForkedKeeper:
-    """A keeper that is forked from this process, as to start Python and import its code costs more than most tests."""
+class ForkedProcess:
+    """A fork of this process that calls `work`, as to start Python and import our code costs more than most tests."""
 
-    def __init__(self, command, pass_fds=()):
+    def __init__(self, work, pass_fds=()):
         self.pid = os.fork()
         if self.pid == 0:
             try:
-                self._keep(command, pass_fds)
+                os.setsid()
+                for number in set(map(int, os.listdir("/proc/self/fd"))) - {1, 2, *pass_fds}:
+                    with suppress(OSError):
+                        os.close(number)
+                gc.freeze()
+                work()
             finally:
                 os._exit(0)
-
-    @staticmethod
-    def _keep(command, pass_fds):
-        os.setsid()
-        for number in set(map(int, os.listdir("/proc/self/fd"))) - {1, 2, *pass_fds}:
-            with suppress(OSError):
-                os.close(number)
-        gc.freeze()
-        sys.argv = command[-3:]
-        writer.main()
 
     def kill(self):
         os.kill(self.pid, signal.SIGKILL)
@@ -112,23 +89,42 @@ class ForkedKeeper:
         deadline_s = time.monotonic() + timeout
         while not os.waitpid(self.pid, os.WNOHANG)[0]:
             if time.monotonic() > deadline_s:
-                raise subprocess.TimeoutExpired("keeper", timeout)
+                raise subprocess.TimeoutExpired("forked process", timeout)
             time.sleep(0.001)
+
+
+class ForkedKeeper(ForkedProcess):
+    """A keeper of the recorder in this process."""
+
+    def __init__(self, command, pass_fds=()):
+        def keep():
+            sys.argv = command[-3:]
+            writer.main()
+
+        super().__init__(keep, pass_fds)
 
 
 class RecordingProcess:
     """A process that records [first:last] of each sample tick, and prints its number, until it is killed."""
 
     def __init__(self, path, first=0, last=99):
-        root = str(Path(__file__).parents[2])
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", _RECORD, str(path), str(first), str(last)],
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=root,
-            env=os.environ | {"PYTHONPATH": root},
-        )
-        self.writer_pid, self.keeper_pid = map(int, self.process.stdout.readline().split())
+        said, say = os.pipe()
+        self.process = ForkedProcess(partial(self._record, path, slice(first, last), say), (say,))
+        os.close(say)
+        self.said = os.fdopen(said)
+        self.writer_pid, self.keeper_pid = map(int, self.said.readline().split())
+
+    @staticmethod
+    def _record(path, which, say):
+        writer_link.spawn_at_normal_priority = ForkedKeeper
+        recorder = ProcessRecorder(recording(path))
+        os.write(say, f"{recorder.writer_pid} {recorder.keeper_pid}\n".encode())
+        for k in range(1, 100_000):
+            now_ns = time.monotonic_ns()
+            recorder.put(now_ns, tick(k, now_ns)[which])
+            recorder.poll()
+            os.write(say, f"{k}\n".encode())
+            time.sleep(0.005)
 
     def __enter__(self):
         return self
@@ -136,7 +132,7 @@ class RecordingProcess:
     def __exit__(self, *_):
         self.process.kill()
         self.process.wait()
-        self.process.stdout.close()
+        self.said.close()
         wait_until(lambda: not alive(self.writer_pid) and not alive(self.keeper_pid))
 
 

@@ -40,7 +40,7 @@ def test_the_cause_is_named_first_with_its_remedy(fault):
     assert "\n" not in first.message
 
 
-@pytest.mark.parametrize("fault", [name for name in FAULTS if "reversed" in name and "encoder" in name])
+@thinned("fault", [name for name in FAULTS if "reversed" in name and "encoder" in name], quick=1)
 def test_a_reversed_encoder_is_put_right_without_turning_its_motor_round(fault):
     change, _, _ = FAULTS[fault]
     first, *_ = found(change(sound()))
@@ -57,7 +57,7 @@ def test_a_sound_log_is_sound_also_in_another_frame_and_without_commands(drive):
 
 
 @pytest.mark.parametrize("drive", ["poor", pytest.param("free", marks=pytest.mark.long)])
-@thinned("name", EFFECTS, quick=6)
+@thinned("name", EFFECTS, quick=3)
 def test_what_a_robot_may_do_is_no_contradiction(name, drive):
     assert found(simulated_drive(realistic(name, 5), seed=5, drive=drive, dirty=True, motors="real")) == ()
 

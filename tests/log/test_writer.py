@@ -95,7 +95,7 @@ def test_what_was_still_on_its_way_when_the_recording_process_was_killed_is_not_
         # Shorter by far than a silent writer is put up with, and many times what may be lost.
         time.sleep(0.3)
         recording_process.process.kill()
-        last_recorded = int(recording_process.process.stdout.readlines()[-1])
+        last_recorded = int(recording_process.said.readlines()[-1])
         os.kill(recording_process.writer_pid, signal.SIGCONT)
         wait_until(lambda: not alive(recording_process.writer_pid))
     assert recorded_ticks(path)[-1] > last_recorded - 20

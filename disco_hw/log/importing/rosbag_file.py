@@ -11,7 +11,7 @@ import re
 import resource
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -88,9 +88,15 @@ class Bag:
     _readers: tuple[Any, ...]  # Any: the library's readers, one for each file that is read by itself.
     _read: Callable[[bytes, str], Any]
     _definitions: Definitions
+    _faults: dict[str, str] = field(default_factory=dict)
 
     def why_unreadable(self, topic: str) -> str:
         """Return why no message of a topic can be read; empty if one can. Parses the bag's definition of its type."""
+        if topic not in self._faults:
+            self._faults[topic] = self._fault(topic)
+        return self._faults[topic]
+
+    def _fault(self, topic: str) -> str:
         kind = self.topics[topic].type
         connections = (one for reader in self._readers for one in reader.connections)
         one = next(one for one in connections if (one.topic, one.msgtype) == (topic, kind))

@@ -116,12 +116,13 @@ class Bench:
         self.now_ns += MS
         if self._under_way:
             self._deliver()
+        robot = self.robot
         for received in self.robot_end.receive():
-            self.robot.receive(self.now_ns, received.frame)
-        self.robot.step(self.now_ns)
-        for frame in self.robot.drain():
+            robot.receive(self.now_ns, received.frame)
+        robot.step(self.now_ns)
+        for frame in robot.drain():
             self._send(self.robot_end, frame)
-        self.largest_speed = max(self.largest_speed, self.robot.speed_rad_s)
+        self.largest_speed = max(self.largest_speed, robot.speed_rad_s)
         if self.now_ns >= self._due_ns:
             self._due_ns += self.period_ns
             if self.host_runs:

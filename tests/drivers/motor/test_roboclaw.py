@@ -19,7 +19,7 @@ ONE, TWO = BY_LABEL["roboclaw"], BY_LABEL["roboclaw-a-board-a-side"]
 STOP = SETTERS["duty_m1m2"].command
 
 
-@pytest.fixture(params=[ONE, TWO], ids=str)
+@pytest.fixture(params=[ONE, pytest.param(TWO, marks=pytest.mark.thorough)], ids=str)
 def bench(request):
     return request.param.bench()
 

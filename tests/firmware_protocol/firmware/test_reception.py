@@ -135,7 +135,7 @@ class Intruder:
         return CODEC.encode("WHEEL_COMMAND", counter, mode="SPEED", valid_for=0.5, session=session, **speeds)
 
 
-@thinned("seed", range(10), quick=4)
+@thinned("seed", range(10), quick=2)
 def test_motion_only_while_armed_or_stopping_and_within_limits_whatever_is_on_the_bus(seed):
     generator = random.Random(seed)
     bench = Bench()

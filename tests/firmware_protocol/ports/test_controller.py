@@ -122,7 +122,7 @@ def test_garbage_on_its_lines_does_no_harm_and_it_answers_afterwards(replay, lin
     assert answers(link, output, "TIME_RESPONSE")[-1]["sequence"] == 77
 
 
-@pytest.mark.parametrize("link", ["serial", "slcan", "can"])
+@thinned("link", ["serial", "slcan", "can"], quick=1)
 def test_a_line_that_never_falls_silent_does_not_hold_up_the_cycle(replay, link):
     """As USB's can be: twice as fast as the core takes it in, for half a second without a gap."""
     frame = LINKS[link][1](0x7FF, bytes(8))

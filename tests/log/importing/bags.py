@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -13,6 +15,7 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from disco_hw.config import Ros2
+from disco_hw.log.drive import chosen
 from disco_hw.log.importing.rosbag import read_rosbag
 from tests.inference.drives import logged, robot_config
 
@@ -110,19 +113,26 @@ class Maker:
         return self.create("sensor_msgs/msg/Image", *fields)
 
 
+@cache
+def typestore(distro):
+    """The types of a release of ROS; to write the code that reads and writes them takes longer than a small bag."""
+    store = get_typestore(distro)
+    if distro is Stores.ROS1_NOETIC:
+        tf = "tf2_msgs/msg/TFMessage"
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf))
+    return store
+
+
 @contextmanager
 def bag(path, storage="mcap", distro=Stores.ROS2_HUMBLE, version=9):
     """A maker for a bag at this path."""
     if storage == "ros1":
         with Writer1(path) as writer:
-            store = get_typestore(Stores.ROS1_NOETIC)
-            tf = "tf2_msgs/msg/TFMessage"
-            store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", tf))
-            yield Maker(writer, store, True)
+            yield Maker(writer, typestore(Stores.ROS1_NOETIC), True)
         return
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     with Writer2(path, version=version, storage_plugin=plugin) as writer:
-        yield Maker(writer, get_typestore(distro), False)
+        yield Maker(writer, typestore(distro), False)
 
 
 def config(**ros2):
@@ -144,6 +154,12 @@ def minus(a, b):
     return a[0] - c * b[0] + s * b[1], a[1] - s * b[0] - c * b[1], yaw
 
 
+def first_seconds(drive, until_s):
+    """What a drive holds before this time."""
+    parts = {name: getattr(drive, name) for name in ("commands", "wheels", "poses")}
+    return replace(drive, **{name: chosen(part, part.t_s < until_s) for name, part in parts.items()})
+
+
 def recorded(path, storage="mcap", distro=Stores.ROS2_HUMBLE, drive=None, cut_s=None, clock=lambda t_s: 0.0, leave=()):
     """A robot with four wheels, an odometry, two SLAMs, a camera and a joystick; returns the drive that it is of.
 
@@ -151,7 +167,7 @@ def recorded(path, storage="mcap", distro=Stores.ROS2_HUMBLE, drive=None, cut_s=
     repeated between corrections. `cut_s`: from and to which second nothing was recorded. `clock`: what the robot's
     clock has added to its stamps by then, s. `leave`: topics left out.
     """
-    drive = logged("poor") if drive is None else drive
+    drive = first_seconds(logged("poor"), 8.0) if drive is None else drive
     robot = robot_config().robot
     r, a = robot.wheel_radius_m, robot.axial_distance_m
     events = []

@@ -1,8 +1,18 @@
 """A robot.toml for the importers."""
 
+import tempfile
+
 import pytest
 
 from tests.inference.test_infer_command import ROBOT
+
+
+@pytest.fixture(scope="module", autouse=True)
+def runtime_root():
+    """Where sockets would go; importers make none, so that one for all tests of a file does."""
+    with tempfile.TemporaryDirectory(prefix="dh-") as name, pytest.MonkeyPatch.context() as patched:
+        patched.setenv("XDG_RUNTIME_DIR", name)
+        yield name
 
 
 @pytest.fixture

@@ -18,12 +18,15 @@ from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export_rosbag, write_rosbag
 from tests.inference.drives import logged, robot_config, write_log
+from tests.inference.test_infer_command import ROBOT
 from tests.log.importing.commands import call
 
 
-@pytest.fixture
-def log(tmp_path, robot):
-    return import_log(write_log(tmp_path / "log.csv", "poor"), robot, tmp_path / "log.mcap").out
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("log")
+    (folder / "robot.toml").write_text(ROBOT)
+    return import_log(write_log(folder / "log.csv", "poor"), folder / "robot.toml", folder / "log.mcap").out
 
 
 def test_what_is_exported_is_imported_again(log, tmp_path):
