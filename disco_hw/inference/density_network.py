@@ -30,9 +30,6 @@ _BATCH = 256
 _VALIDATION_SHARE = 0.15
 _RIDGE = 1e-3
 _CLIP_NORM = 5.0
-# Of AdamW, as torch has them: how fast its two moments forget, and what keeps its denominator from zero.
-_MOMENTS = 0.9, 0.999
-_EPSILON = 1e-8
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,38 +228,6 @@ def _least_squares(features: Array, targets: Array) -> tuple[Array, Array]:
     return skip, np.maximum((targets - columns @ skip).std(axis=0), 1e-3)
 
 
-class _AdamW:
-    """AdamW whose rate falls to zero along a cosine; the weights of torch.optim's to the last bit.
-
-    That of torch loads its compiler, which takes a process several seconds.
-    """
-
-    def __init__(self, parameters: list[torch.nn.Parameter], settings: NetworkSettings) -> None:
-        self._parameters = [(each, torch.zeros_like(each), torch.zeros_like(each)) for each in parameters]
-        self._rate, self._decay, self._epochs = settings.rate, settings.decay, settings.epochs
-        self._steps = self._epoch = 0
-
-    @torch.no_grad()
-    def step(self) -> None:
-        """Go one step down the parameters' gradients."""
-        self._steps += 1
-        fast, slow = _MOMENTS
-        by, root = -self._rate / (1.0 - fast**self._steps), (1.0 - slow**self._steps) ** 0.5
-        for parameter, mean, square in self._parameters:
-            gradient = parameter.grad
-            assert gradient is not None
-            parameter.mul_(1.0 - self._rate * self._decay)
-            mean.lerp_(gradient, 1.0 - fast)
-            square.mul_(slow).addcmul_(gradient, gradient, value=1.0 - slow)
-            parameter.addcdiv_(mean, (square.sqrt() / root).add_(_EPSILON), value=by)
-
-    def end_epoch(self) -> None:
-        """Lower the rate for the next epoch."""
-        self._epoch += 1
-        before, after = (1.0 + math.cos(math.pi * each / self._epochs) for each in (self._epoch - 1, self._epoch))
-        self._rate *= after / before
-
-
 def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSettings) -> None:
     """Train an ensemble in place, with early stopping by the log density of held-out pairs."""
     members, count = settings.members, x.shape[0]
@@ -271,19 +236,20 @@ def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSetti
     validation, training = order[:, :validation_count], order[:, validation_count:]
     valid_x, valid_y = x[validation], y[validation]
     batches = max(1, training.shape[1] // _BATCH)
-    optimiser = _AdamW(list(stack.parameters()), settings)
+    optimiser = torch.optim.AdamW(stack.parameters(), lr=settings.rate, weight_decay=settings.decay)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
     best = torch.full((members,), -math.inf)
     since = torch.zeros(members)
     kept = [parameter.detach().clone() for parameter in stack.parameters()]
     for _ in range(settings.epochs):
         shuffled = torch.stack([row[torch.randperm(row.shape[0])] for row in training])
         for batch in shuffled.tensor_split(batches, dim=1):
-            stack.zero_grad()
+            optimiser.zero_grad(set_to_none=True)
             loss = -stack.log_density(x[batch], y[batch]).mean(dim=1).sum()
             loss.backward()  # type: ignore[no-untyped-call]
             torch.nn.utils.clip_grad_norm_(stack.parameters(), _CLIP_NORM * math.sqrt(members))
             optimiser.step()
-        optimiser.end_epoch()
+        schedule.step()
         with torch.no_grad():
             score = stack.log_density(valid_x, valid_y).mean(dim=1)
         better = score > best

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from disco_hw.inference.density_network import Mixtures, NetworkSettings, _AdamW, train
+from disco_hw.inference.density_network import Mixtures, NetworkSettings, train
 
 SMALL = NetworkSettings(members=2, hidden=16, epochs=40)
 
@@ -21,27 +21,6 @@ def test_a_linear_problem_is_learned_with_its_correlation():
     draws = mixtures.draw(20000, np.random.default_rng(0))[0]
     assert draws.mean(axis=0) == pytest.approx([0.2, -0.3], abs=0.03)
     assert np.cov(draws.T) == pytest.approx(np.array([[0.01, 0.008], [0.008, 0.01]]), rel=0.3)
-
-
-# torch's own takes seconds to load.
-@pytest.mark.thorough
-def test_a_step_is_that_of_torchs_adamw_with_a_rate_along_a_cosine():
-    settings = NetworkSettings(epochs=4)
-    start = torch.randn(2, 3, generator=torch.Generator().manual_seed(1))
-    ours, theirs = (torch.nn.Parameter(start.clone()) for _ in range(2))
-    mine = _AdamW([ours], settings)
-    torchs = torch.optim.AdamW([theirs], lr=settings.rate, weight_decay=settings.decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(torchs, settings.epochs)
-    for step in range(8):
-        for each in (ours, theirs):
-            each.grad = (each.detach() ** 3) - 0.1 * step
-        mine.step()
-        torchs.step()
-        assert torch.equal(ours, theirs)
-        if step % 2:
-            mine.end_epoch()
-            schedule.step()
-    assert not torch.equal(ours, start)
 
 
 @pytest.mark.thorough
