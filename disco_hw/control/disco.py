@@ -182,7 +182,7 @@ class Disco:
         refined = self._refined(begin, system, nominal) if outcome in REFINED else None
         diagnostics = sampling.diagnostics(outcome, retries, self._speed_part(outcome))
         trajectory = begin.mean_path(self._points.mean_run, nominal) if refined is None else refined[1]
-        if guided and self._is_guided(now_ns, system, trajectory):
+        if guided and self._is_guided(now_ns, system, trajectory, refined is not None):
             optimiser.use_guide()
             nominal = optimiser.nominal()
             trajectory = begin.mean_path(self._points.mean_run, nominal)
@@ -227,11 +227,11 @@ class Disco:
             self.optimiser.reset()
             raise
 
-    def _is_guided(self, now_ns: int, system: SkidSteer, trajectory: Array) -> bool:
+    def _is_guided(self, now_ns: int, system: SkidSteer, trajectory: Array, is_refined: bool) -> bool:
         """Whether the guide has the robot, whatever the plan costs."""
         if not self.optimiser.guide_is_valid or self._sampling.guide_touches:
             return False
-        return self._guidance.has_robot(now_ns, system, self.chassis, trajectory)
+        return self._guidance.has_robot(now_ns, system, self.chassis, trajectory, is_refined)
 
     def _set_refined_model(self) -> None:
         """Refine in the mean of the belief in force."""

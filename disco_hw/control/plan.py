@@ -22,7 +22,7 @@ from disco_hw.model.drift import NO_DRIFT, Drift
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 8, 8, 5
+PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 9, 9, 5
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
 1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
@@ -31,8 +31,9 @@ that carries the robot, where the log's beliefs say so. 6: with the lag of the b
 another weight of the end, and tables of long paths as fine as those of short ones; `control.disturbance`, followed up
 to `DISTURBANCE_UNTIL_VERSION`, does nothing. 7: from commands that the model says do not turn the wheels as fast, and
 further ahead where the tracked point lies far behind the centre of rotation. 8: with a guide that ends its turns in
-time and comes back from beyond a corner, and that takes no robot over while it brakes. Logs since `SAME_SINCE_VERSION`
-are replayed alike.
+time and comes back from beyond a corner, and that takes no robot over while it brakes. 9: slower before what the
+wheels' acceleration cannot follow, as a corner, and turned beyond a right angle to the line where the line asks for it.
+Logs since `SAME_SINCE_VERSION` are replayed alike.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter

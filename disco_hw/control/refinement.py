@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from disco_hw.control.backwards import task_of, turned_chassis, turned_start
 from disco_hw.control.kernel import CARRIED_X, CARRIED_Y, START_COS, START_SIN, START_X, START_Y, Terms
-from disco_hw.control.kernel.guide import SteeredChassis, timed_reference
+from disco_hw.control.kernel.guide import SteeredChassis
 from disco_hw.control.kernel.refine import CHANNELS, STATE_COLUMNS, Buffers, LateralLag, Problem, refine
+from disco_hw.control.kernel.timed_reference import PARTS, SPEED_COLUMNS, timed_reference
 from disco_hw.control.parameter_points import mean_point
 from disco_hw.control.plan import CommandLimits, DiscoSettings
 from disco_hw.control.state_prediction import PlanStart
@@ -72,6 +73,7 @@ class Refinement:
         self._series = integration_series(settings.step_s, wide=True)
         self._reference = np.zeros((self._rows.size, CHANNELS), np.float32)
         self._found = np.ones(6, np.float32)
+        self._speeds = np.zeros((PARTS * self._rows.size, SPEED_COLUMNS), np.float32)
         self._beyond = np.zeros((BEYOND + 1, CHANNELS), np.float32)
         self._start, self._before = np.zeros(5), np.zeros(CHANNELS)
         self._compiled: dict[str, Callable[..., float]] = {}
@@ -157,7 +159,8 @@ class Refinement:
         if hasattr(terms, "line_at"):
             self._call(
                 "timed reference", timed_reference, self._reference, terms, start, self._chassis,
-                self._limits.speed_rad_s, self._step_s, self._found, self._beyond, BEYOND_X_ICR / BEYOND * x_icr_m,
+                self._limits.speed_rad_s, self._limits.acceleration_rad_s2, self._step_s, self._speeds, self._found,
+                self._beyond, BEYOND_X_ICR / BEYOND * x_icr_m,
             )  # fmt: skip
             if carried_m and x_icr_m > SMALLEST_X_ICR_M:
                 last_m = math.dist(*self._reference[-2:].tolist())

@@ -133,10 +133,13 @@ class Guidance:
             self._guide(commands, terms, *arguments)
         return True
 
-    def has_robot(self, now_ns: int, system: SkidSteer, chassis: SteeredChassis, trajectory: Array) -> bool:
+    def has_robot(
+        self, now_ns: int, system: SkidSteer, chassis: SteeredChassis, trajectory: Array, is_refined: bool
+    ) -> bool:
         """Whether the guide has the robot: for a horizon from a plan on that stands, as across the line or far off it.
 
-        Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan.
+        Turning in from there costs more than standing for as long as is planned, or is put off from plan to plan. One
+        that `is_refined` is slow where the wheels must be, as at a corner, and gives up by itself where it stands.
         """
         settings = self._settings
         horizon_s = settings.sampler.horizon * settings.step_s
@@ -146,7 +149,7 @@ class Guidance:
         begin, *places = trajectory[: half + 1, :2].tolist()
         # A robot that is on its way brakes by such a plan, as before a corner, and does not stand.
         rolls_m_s = 0.5 * chassis.wheel_radius_m * abs(float(system.start[START_LEFT] + system.start[START_RIGHT]))
-        is_slow = rolls_m_s * half * settings.step_s < NEAR_ZERO_SPEED * way_m
+        is_slow = not is_refined and rolls_m_s * half * settings.step_s < NEAR_ZERO_SPEED * way_m
         if is_slow and all(math.dist(begin, place) < NEAR_ZERO_SPEED * way_m for place in reversed(places)):
             self.until_ns = now_ns + round(horizon_s * 1e9)
         return self.until_ns is not None and now_ns < self.until_ns

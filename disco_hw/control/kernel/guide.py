@@ -1,14 +1,10 @@
-"""Driving along the task's line: the commands of a steering law, and a reference in time.
+"""Driving along the task's line: the commands of a steering law.
 
 One more sample, the guide, is the commands of a steering law that follows the line from where the robot is. Samples
 lie around the last plan and cut the corners that it cuts. Turning before a corner comes first, then a worse cost, then
 a better one: no small change of a plan finds it. The law does at once, as it acts on the centre of rotation along the
 stable inverse (tasks/line/course.py) of the line. The guide is costed as every sample is; how the planner goes over to
 it is written in `Disco`.
-
-The reference for the refinement starts at the place on the line beside the robot and moves on at the task's speed, or
-as fast as the wheels allow: where a robot that stays on the line would turn a wheel faster than its limit, the
-reference takes longer. So a robot whose wheels cannot do what the task requests stays on the line and goes slower.
 """
 
 from __future__ import annotations
@@ -37,8 +33,10 @@ from disco_hw.model.drift import MOVES_RAD_S
 
 # The law's gains (1/m): of the heading, and of the distance, which the robot comes back from at this angle a metre.
 YAW_PER_M, ANGLE_PER_M = 9.0, 3.3
-# Over so much of the way is the reference's turning taken; a corner is turned about within it.
+# Over so much of the way is the line's turning taken; a corner is turned about within it.
 TURN_M = 0.04
+# Between two points so far apart the line is straight.
+NEARBY_M = 1e-3
 # Below this a command is lifted over the dead band in part, so that a wheel at rest does not chatter (rad/s).
 LIFTED_RAD_S = 0.05
 # A robot that faces elsewhere goes on at this part of its speed: turning on the spot by the middle of a bend, it could
@@ -48,10 +46,6 @@ SLOWEST = 0.2
 # to go aside faster than the robot turns. It goes on at this part of its speed, and cuts the line: the law would else
 # hold it still there for ever.
 LEAST_FORWARD = 0.3
-# The line is sampled so many times a step, as its direction may change within one.
-PARTS = 4
-# The reference uses this part of the wheels' speed, so that some is left to return to the line.
-USED_SPEED = 0.94
 
 
 class SteeredChassis(NamedTuple):
@@ -83,14 +77,14 @@ def guide(
     settled = (1.0 - keep) * lead_s / step_s
     for t in range(commands.shape[0]):
         place = place_of(terms, place, x, y)
-        at_x, at_y, head_x, head_y, _, speed = line_at(terms, place, 0.0)
+        at_x, at_y, head_x, head_y, _, speed = _ahead_at(terms, place, 0.0)
         away_x, away_y = x - at_x + x_icr_m * (cos_yaw - head_x), y - at_y + x_icr_m * (sin_yaw - head_y)
         back = math.atan(ANGLE_PER_M * (away_y * head_x - away_x * head_y))
         off_rad = math.atan2(sin_yaw * head_x - cos_yaw * head_y, cos_yaw * head_x + sin_yaw * head_y) + back
         returning = math.sin(back) * math.sin(back)
         # What the wheels are to do when the command acts.
-        _, _, from_x, from_y, along, _ = line_at(terms, place, speed * lead_s)
-        _, _, to_x, to_y, _, _ = line_at(terms, place, speed * lead_s + TURN_M)
+        _, _, from_x, from_y, along, _ = _ahead_at(terms, place, speed * lead_s)
+        _, _, to_x, to_y, _, _ = _ahead_at(terms, place, speed * lead_s + TURN_M)
         bend = math.atan2(from_x * to_y - from_y * to_x, from_x * to_x + from_y * to_y) / TURN_M
         off_rad = math.atan2(math.sin(off_rad), math.cos(off_rad))
         turn = speed * (bend - YAW_PER_M * off_rad)
@@ -124,6 +118,19 @@ def guide(
         cos_yaw, sin_yaw = cos_yaw * cos_half - sin_yaw * sin_half, sin_yaw * cos_half + cos_yaw * sin_half
 
 
+@kernel_function
+def _ahead_at(terms: Terms, place: float, ahead_m: float) -> tuple[float, float, float, float, float, float]:
+    """`line_at`, but with a heading across the line where a robot that stays on it would drive backwards."""
+    x, y, head_x, head_y, along, speed = line_at(terms, place, ahead_m)
+    if along < 0.0:
+        next_x, next_y, _, _, _, _ = line_at(terms, place, ahead_m + NEARBY_M)
+        length = max(math.hypot(next_x - x, next_y - y), 1e-9)
+        way_x, way_y = (next_x - x) / length, (next_y - y) / length
+        side = math.copysign(1.0, way_x * head_y - way_y * head_x)
+        head_x, head_y, along = -side * way_y, side * way_x, 0.0
+    return x, y, head_x, head_y, along, speed
+
+
 @scalar_function
 def _within(left: float, right: float, dead: float, largest: float) -> tuple[float, float]:
     """Commands for these wheel speeds: lifted over the dead band; if one is too fast, both slower on the same curve."""
@@ -140,43 +147,3 @@ def _lifted(speed: float, dead: float) -> float:
 @scalar_function
 def _beyond(command: float, dead: float) -> float:
     return math.copysign(max(abs(command) - dead, 0.0), command)
-
-
-@kernel_function
-def timed_reference(
-    reference: Floats, terms: Terms, start: Floats, chassis: SteeredChassis, largest_rad_s: float, step_s: float,
-    found: Floats, beyond: Floats, beyond_m: float,
-) -> None:  # fmt: skip
-    """Fill `reference` (T, 2) with points (m), relative to the task's origin.
-
-    `start` (10,) is the state of `SkidSteer`. Sets `found` (6,): distance to the line (m), cosine of the angle between
-    the robot and the heading in which it would stay on the line, the part of the task's speed that the wheels can do,
-    at most 1, that heading at the end (cosine, sine), and the length of the way from the first point to the last (m).
-    And `beyond` (N, 2): that last point, and those behind it along the line, `beyond_m` apart.
-    """
-    x, y, cos_yaw, sin_yaw = start[START_X], start[START_Y], start[START_COS], start[START_SIN]
-    place = place_of(terms, start[START_MEMORY], x, y)
-    at_x, at_y, head_x, head_y, _, _ = line_at(terms, place, 0.0)
-    found[0] = math.hypot(x - at_x, y - at_y)
-    found[1] = cos_yaw * head_x + sin_yaw * head_y
-    fastest = USED_SPEED * max(largest_rad_s - chassis.dead_rad_s, 0.0) * chassis.wheel_radius_m
-    half_axle, part_s = 0.5 * chassis.axial_distance_m, step_s / PARTS
-    ahead, requested, way_m = 0.0, 0.0, 0.0
-    for t in range(reference.shape[0]):
-        for _ in range(PARTS):
-            _, _, from_x, from_y, along, speed = line_at(terms, place, ahead)
-            way = speed * part_s
-            _, _, to_x, to_y, _, _ = line_at(terms, place, ahead + way)
-            turn = math.atan2(from_x * to_y - from_y * to_x, from_x * to_x + from_y * to_y)
-            # How far the faster wheel rolls, and how far it can.
-            rolls = abs(way * along) + half_axle * abs(turn)
-            ahead += way * min(1.0, fastest * part_s / max(rolls, 1e-9))
-            requested += way
-        at_x, at_y, head_x, head_y, _, _ = line_at(terms, place, ahead)
-        reference[t, 0], reference[t, 1] = at_x, at_y
-        if t > 0:
-            way_m += math.hypot(at_x - reference[t - 1, 0], at_y - reference[t - 1, 1])
-    found[2] = ahead / requested if requested > 0.0 else 1.0
-    found[3], found[4], found[5] = head_x, head_y, way_m
-    for n in range(beyond.shape[0]):
-        beyond[n, 0], beyond[n, 1], _, _, _, _ = line_at(terms, place, ahead + n * beyond_m)

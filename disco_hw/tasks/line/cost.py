@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from disco_hw.tasks import Found, Prepared, constant, helper, norm_and_inverse, norm_of_three, single
 from disco_hw.tasks.line import PathTable
-from disco_hw.tasks.line.course import turned_sines
+from disco_hw.tasks.line.course import turned_tangents
 
 # Chosen: time constant of coming to the end; shorter brakes later and harder.
 SLOW_DOWN_S = 1.0
@@ -91,7 +91,7 @@ class PathTerms(NamedTuple):
 
     `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
     it goes in x and y (m). `turned` (2 M,): the sine by which a robot on the path is turned from each piece at its
-    begin, and by how much more at its end (`course.turned_sines`). Places count in entries from where the robot is:
+    begin, and by how much more at its end (`course.turned_tangents`). Places count in entries from where the robot is:
     `first` and `last` are the table's ends, `end` is where the robot stops, or infinite. `per_m`: entries a metre;
     `speed_m_s`; `speed_per_entry`: progress speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each
     entry left; `speed_weight`: of missing speed; `terminal_steps`: weight of the last distance; `turn_m`: what the last
@@ -148,8 +148,7 @@ class PathTerms(NamedTuple):
         row, part = 4 * index, place - np.floor(min(place, self.last - _ONE))
         step_x, step_y = self.table[row + 2], self.table[row + 3]
         _, per_m = norm_and_inverse(step_x, step_y)
-        sine = self.turned[2 * index] + part * self.turned[2 * index + 1]
-        cosine = math.sqrt(max(_ONE - sine * sine, _ZERO))
+        cosine, sine = _turned(self.turned[2 * index] + part * self.turned[2 * index + 1])
         along_x, along_y = step_x * per_m, step_y * per_m
         speed = min(self.speed_m_s, max((self.end - place) * self.slow_per_entry, _ZERO))
         x, y = self.table[row] + part * step_x, self.table[row + 1] + part * step_y
@@ -181,8 +180,7 @@ class PathTerms(NamedTuple):
         off_x, off_y, along_x, along_y = _offset(self.last, memory, x, y, found[1:])
         piece = np.floor(min(memory, self.last - _ONE))
         row = np.int32(piece - self.first) * 2
-        sine = self.turned[row] + (memory - piece) * self.turned[row + 1]
-        cosine = math.sqrt(max(_ONE - sine * sine, _ZERO))
+        cosine, sine = _turned(self.turned[row] + (memory - piece) * self.turned[row + 1])
         along, across = cos_yaw * along_x + sin_yaw * along_y, sin_yaw * along_x - cos_yaw * along_y
         forwards, turn = along * cosine + across * sine, abs(across * cosine - along * sine)
         turn = turn if forwards > _ZERO else _TWO - turn
@@ -193,6 +191,13 @@ class PathTerms(NamedTuple):
 def _row(place: float, first: float, last: float) -> int:
     """Return the index of the table's row for a place."""
     return int(np.floor(min(place, last - _ONE)) - first)
+
+
+@helper
+def _turned(tangent: float) -> tuple[float, float]:
+    """Cosine and sine of an angle, from the tangent of its half."""
+    whole = _ONE / (_ONE + tangent * tangent)
+    return (_ONE - tangent * tangent) * whole, (tangent + tangent) * whole
 
 
 @helper
@@ -227,7 +232,7 @@ def _nearby(path: PathTable, block: int, reach: int, x_icr_m: float) -> _Nearby:
     # An open path's last entry is one of its own: it is not the first.
     origin = table[block * NEAR % count if path.closed else block * NEAR, :2]
     pieces = np.hstack([here - origin, there - here]).astype(np.float32)
-    turned = turned_sines(path, x_icr_m, first, end).astype(np.float32)
+    turned = turned_tangents(path, x_icr_m, first, end).astype(np.float32)
     x_m, y_m = origin.tolist()
     return _Nearby(pieces.reshape(-1), turned.reshape(-1), first, (x_m, y_m))
 

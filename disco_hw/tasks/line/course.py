@@ -253,6 +253,8 @@ def _turn_back(path: PathTable, heading: Array, turned_rad: float, least_m: floa
 SMALLEST_X_ICR_M = 0.01
 # Chosen: what is so many times x_icr further along the line changes a heading by no more than rounding does.
 _FORGETS_X_ICR = 40.0
+# More than any turn that is no sharp one.
+_MOST_TURNED_RAD = 2.6
 
 
 def stable_yaw(along_rad: Array, spacing_m: float | Array, x_icr_m: float, closed: bool) -> Array:
@@ -286,8 +288,10 @@ def stable_yaw(along_rad: Array, spacing_m: float | Array, x_icr_m: float, close
     return np.array(yaw)
 
 
-def turned_sines(path: PathTable, x_icr_m: float, first: int, end: int) -> Array:
-    """Sine by which the robot is turned from each piece of a part at its begin, and how much more at its end: (M, 2).
+def turned_tangents(path: PathTable, x_icr_m: float, first: int, end: int) -> Array:
+    """Tangents of half the angle that the robot is turned by from each piece, at its begin and the rest to its end.
+
+    (M, 2); a robot on the line faces across it, or backwards along it, where it turns by more than a right angle.
 
     Of the pieces `first` to `end` - 1, which on a closed path may be counted beyond its table. The line further on
     counts as far as the heading remembers it.
@@ -307,5 +311,5 @@ def turned_sines(path: PathTable, x_icr_m: float, first: int, end: int) -> Array
         yaw = stable_yaw(along[here:there], path.spacing_m, x_icr_m, False)
         turned[here:there] = np.column_stack([yaw[:-1], yaw[1:]]) - along[here:there, None]
     part = turned[first - begin : end - begin]
-    sines = np.sin(np.clip(part, -0.5 * math.pi, 0.5 * math.pi))
-    return np.column_stack([sines[:, 0], sines[:, 1] - sines[:, 0]])
+    tangents = np.tan(0.5 * np.clip(part, -_MOST_TURNED_RAD, _MOST_TURNED_RAD))
+    return np.column_stack([tangents[:, 0], tangents[:, 1] - tangents[:, 0]])

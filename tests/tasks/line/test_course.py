@@ -7,7 +7,7 @@ import pytest
 
 from disco_hw.tasks.circle import CircleTask
 from disco_hw.tasks.line import PathTable
-from disco_hw.tasks.line.course import stable_yaw, turned_sines
+from disco_hw.tasks.line.course import stable_yaw, turned_tangents
 from disco_hw.tasks.path import PathTask
 from disco_hw.tasks.timed_path import TimedPathTask
 
@@ -77,7 +77,7 @@ def test_the_headings_along_a_part_of_a_line_are_those_along_all_of_it(x_icr_m, 
     count = len(path.table) - 1
     along = np.unwrap(np.arctan2(path.table[:-1, 3], path.table[:-1, 2]))
     yaw = stable_yaw(along, path.spacing_m, x_icr_m, True)
-    begin, end = np.sin(yaw[:-1] - along), np.sin(yaw[1:] - along)
+    begin, end = np.tan(0.5 * (yaw[:-1] - along)), np.tan(0.5 * (yaw[1:] - along))
     at = np.arange(first, first + 100) % count
     expected = np.column_stack([begin, end - begin])[at]
-    np.testing.assert_allclose(turned_sines(path, x_icr_m, first, first + 100), expected, atol=1e-12)
+    np.testing.assert_allclose(turned_tangents(path, x_icr_m, first, first + 100), expected, atol=1e-12)
