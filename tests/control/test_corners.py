@@ -66,4 +66,4 @@ def test_a_robot_is_turned_beyond_a_right_angle_to_the_line_before_a_turn_of_mor
     """Its tracked point comes to the corner along the line while it backs: facing less it would pass beside it."""
     turn_rad = math.radians(114.0)
     places, _ = drive_round_a_corner((0.061, 0.415, x_icr_m), CommandLimits(8.0, 20.0), 0.5, turn_rad)
-    assert off_m(places, turn_rad).max() < 0.01
+    assert off_m(places, turn_rad).max() < 0.015

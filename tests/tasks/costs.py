@@ -99,11 +99,11 @@ def path_cost(
     right = stable_yaw(along_rad, path.spacing_m, rounded_m, endless)
 
     def turned(at: Array) -> Array:
-        """Heading (rad) of a robot on the path, at places: its sine beside the piece goes evenly from end to end."""
+        """Heading (rad) of a robot on the path: half its angle to the piece has a tangent even from end to end."""
         index = np.minimum(at, last - 1.0).astype(int)
         along = along_rad[index - int(first)]
-        begin, end = (np.clip(right[index - int(first) + i] - along, -0.5 * math.pi, 0.5 * math.pi) for i in (0, 1))
-        return np.asarray(along + np.arcsin(np.sin(begin) + (at - index) * (np.sin(end) - np.sin(begin))))
+        begin, end = (np.clip(0.5 * (right[index - int(first) + i] - along), -1.3, 1.3) for i in (0, 1))
+        return np.asarray(along + 2.0 * np.arctan(np.tan(begin) + (at - index) * (np.tan(end) - np.tan(begin))))
 
     def off(at: Array, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
         """Offset from the path's point at a place, and the path's direction there."""
