@@ -270,7 +270,7 @@ class PlannerEvents:
         if found.speed_part < LIMITED_PART and not self._is_limited:
             self._is_limited = True
             events.append(
-                f"planner: the speed is limited by the wheels to {found.speed_part:.0%} of the task's; "
+                f"planner: the wheels limit the speed here, to {found.speed_part:.0%} of the task's; "
                 "the robot follows its line more slowly"
             )
         return tuple(events)

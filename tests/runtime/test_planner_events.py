@@ -8,7 +8,7 @@ from disco_hw.control.plan import Diagnostics, WheelPlan
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.plausibility import LIMITED_PART, PlannerEvents
 
-LIMITED = "planner: the speed is limited by the wheels to 70% of the task's; the robot follows its line more slowly"
+LIMITED = "planner: the wheels limit the speed here, to 70% of the task's; the robot follows its line more slowly"
 
 
 def _plan(speed_part: float) -> WheelPlan:

@@ -90,12 +90,12 @@ class PathTerms(NamedTuple):
     """The cost along the part of a path's table that can be reached within the horizon.
 
     `table` (4 M,): for each piece between two entries, from one to the next, where it begins, x and y (m), and how far
-    it goes in x and y (m). `turned` (2 M,): the sine by which a robot on the path is turned from each piece at its
-    begin, and by how much more at its end (`course.turned_tangents`). Places count in entries from where the robot is:
-    `first` and `last` are the table's ends, `end` is where the robot stops, or infinite. `per_m`: entries a metre;
-    `speed_m_s`; `speed_per_entry`: progress speed of one entry in a step (m/s); `slow_per_entry`: wanted speed for each
-    entry left; `speed_weight`: of missing speed; `terminal_steps`: weight of the last distance; `turn_m`: what the last
-    heading counts if it is straight across, and half of what it does backwards (m).
+    it goes in x and y (m). `turned` (2 M,): the tangent of half the angle by which a robot on the path is turned from
+    each piece at its begin, and how much more at its end (`course.turned_tangents`). Places count in entries from where
+    the robot is: `first` and `last` are the table's ends, `end` is where the robot stops, or infinite. `per_m`:
+    entries a metre; `speed_m_s`; `speed_per_entry`: progress speed of one entry in a step (m/s); `slow_per_entry`:
+    wanted speed for each entry left; `speed_weight`: of missing speed; `terminal_steps`: weight of the last
+    distance; `turn_m`: what the last heading counts if it is straight across, and half of what it does backwards (m).
     """
 
     table: NDArray[np.float32]

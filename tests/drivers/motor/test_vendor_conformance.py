@@ -221,7 +221,7 @@ def test_one_side_lost_stops_the_other_and_is_a_fault_until_it_is_mended_and_res
     drive(bench)
 
 
-@thinned("when", ["armed", "before", "standby", "arming", "stopping", "fault"], quick=1)
+@thinned("when", ["armed", "before", "standby", "arming", "stopping", "fault"], quick=2)
 def test_the_emergency_stop_stops_in_every_state(vendor, new_bench, when):
     if when != "before":
         new_bench.run_until(*IDLE_STATES)
