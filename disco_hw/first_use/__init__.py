@@ -93,7 +93,7 @@ _OPEN_S = 2.0
 # Chosen: longer than the pause of any device that sends by itself, which a question would disturb.
 _SILENT_S = 0.3
 # Chosen: longer than a busy computer keeps a process waiting; there are few questions.
-_PATIENT_S = 0.1
+_PATIENT_S = 0.25
 # Chosen: some seconds of a full bus at 500 kbit/s; a kind of controller shows within far fewer.
 _MOST_FRAMES = 20_000
 

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import select
+import termios
 import threading
 import time
 import tty
+from collections import deque
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,6 +28,8 @@ from tests.first_use.miswired import MiswiredRobot, Miswiring, robot_file
 from tests.hil.stack import disco_here, virtual_robot
 from tools.stack import write_robot_file
 
+OUTPUT_SPEED = 5
+"""In what `termios.tcgetattr` gives."""
 SIMULATED = {"reference": {}, "odrive": {"nodes": [3, 5]}, "vesc": {"nodes": [23, 51]}, "agilex": {}}
 
 
@@ -106,22 +110,29 @@ def test_what_no_robot_is_like_is_refused_and_nothing_is_left(tmp_path):
 
 @contextmanager
 def line_with(*boards, chatter=b"", late_s=0.0):
-    """A serial port with these boards at its other end; its name, and all that they have heard."""
+    """A serial port with these boards at its other end, at 115200 baud; its name, and all that they have heard.
+
+    `late_s`: from a question to its reply.
+    """
     robot, host = os.openpty()
     tty.setraw(host)
     received_bytes, ended = bytearray(), threading.Event()
 
     def serve():
+        waiting = deque()
         while not ended.is_set():
             if chatter:
                 os.write(robot, chatter)
-            if not select.select([robot], [], [], 0.01)[0]:
-                continue
-            received = os.read(robot, 4096)
-            received_bytes.extend(received)
-            time.sleep(late_s)
-            for board in boards:
-                os.write(robot, board.receive(0, received))
+            if select.select([robot], [], [], 0.002)[0]:
+                received = os.read(robot, 4096)
+                received_bytes.extend(received)
+                # What is sent at another speed is noise to a board, and its replies are to this computer.
+                if termios.tcgetattr(host)[OUTPUT_SPEED] == termios.B115200:
+                    waiting.append((time.monotonic() + late_s, received))
+            while waiting and waiting[0][0] <= time.monotonic():
+                _, received = waiting.popleft()
+                for board in boards:
+                    os.write(robot, board.receive(0, received))
 
     served = threading.Thread(target=serve)
     served.start()

@@ -386,12 +386,12 @@ def messages_until(lines, count):
 
 
 def test_a_reader_that_is_killed_is_said_and_one_whose_daemon_has_gone_ends(create_source):
+    # First, as it takes long on a busy computer: a receiver that says nothing for 3 s is connected to anew.
+    stack = simulated_stack(NoPlanner())
     with socket.create_server(("127.0.0.1", 0)) as server:
         source = create_source("nmea", device=f"socket://127.0.0.1:{server.getsockname()[1]}")
-        receiver, _ = server.accept()
-        opened(source)
-        stack = simulated_stack(NoPlanner())
         stack.core.pose_source = source
+        receiver, _ = server.accept()
         receiver.sendall(GGA_ALONE)
         receive_until(source, lambda found, _: found)
         os.kill(source._process.pid, signal.SIGKILL)
