@@ -151,7 +151,7 @@ def sampled_commands(disco, before, sampler, state):
     by_knot = noise.T.reshape(sampler.samples, sampler.knots, 2)
     spread = np.einsum("tj,ktjc->ktc", weights, by_knot[:, first[:, None] + np.arange(4)])
     last = state.sent[-1]
-    anchor = np.array(disco._prediction.anchor(state, 0.0))
+    anchor = np.array(disco._prediction.anchor(state, state.elapsed_s))
     assert np.all(np.abs(anchor - (last.left_rad_s, last.right_rad_s)) <= 12.0)
     change = LIMITS.acceleration_rad_s2 * STEP_S
     commands = oracle.limited(before, spread, anchor, LIMITS.speed_rad_s, change)
