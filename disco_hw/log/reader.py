@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -14,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.errors import LogError
+from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, open_file
 from disco_hw.log import End
 from disco_hw.log.container import (
@@ -353,6 +355,24 @@ class Log:
 def open_log(path: Path) -> Log:
     """Open a log of ours; raises LogError, with one line for the user, if it is none."""
     return Log(path)
+
+
+@contextlib.contextmanager
+def open_parts(path: Path) -> Iterator[list[Log]]:
+    """Open a log and the parts beside it that go on with it, in their order; raises LogError as `open_log`.
+
+    All parts of a run have its offset of the clocks, to the nanosecond. A part that cannot be opened is left out.
+    """
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(open_log(path))
+        parts = []
+        for other in path.parent.glob(f"{glob.escape(path.stem)}.part*{glob.escape(path.suffix)}"):
+            with contextlib.suppress(LogError, InputError):
+                part = stack.enter_context(open_log(other))
+                is_later = part.metadata.part > max(first.metadata.part, 1)
+                if is_later and part.metadata.wall_offset_ns == first.metadata.wall_offset_ns:
+                    parts.append(part)
+        yield [first, *sorted(parts, key=lambda part: part.metadata.part)]
 
 
 def _contents(fd: int, path: Path) -> Contents:
