@@ -119,6 +119,10 @@ def _describe_end(summary: LogSummary) -> str:
     )
 
 
+# Chosen: above the drift of a clock in hours.
+_CLOCK_CHANGE_S = 1.0
+
+
 def _describe(summary: LogSummary) -> str:
     size_mb = summary.bytes / 1e6
     count = summary.segment_breaks
@@ -129,6 +133,13 @@ def _describe(summary: LogSummary) -> str:
         f"{summary.ticks} ticks, {summary.missing_ticks} missing{breaks}; {_describe_end(summary)}",
     ]
     lines += [f"continues {summary.continues}"] if summary.continues else []
+    ahead_s = summary.wall_clock_change_s
+    if abs(ahead_s) >= _CLOCK_CHANGE_S:
+        ahead = "ahead of" if ahead_s > 0.0 else "behind"
+        lines.append(
+            f"at its end the wall clock was {abs(ahead_s):.1f} s {ahead} the wall-clock times of the log: the computer "
+            "was suspended, or its clock was set"
+        )
     lines += [
         f"  {topic:<24} {item.count:>9}  {item.rate_hz:8.1f} Hz" for topic, item in sorted(summary.topics.items())
     ]

@@ -122,7 +122,8 @@ class LogSummary(msgspec.Struct, frozen=True):
     `missing_ticks` were given to the recorder and are not in the file: between its ticks, before the first as far as
     the former part says, and after the last where the log was ended. `segment_breaks`: of an import, how often a new
     segment begins. `ended`: the recorder ended it, at `end`; None for
-    a log from before that was recorded. `continued`: as the file was full, and the log goes on in another part.
+    a log from before that was recorded. `wall_clock_change_s`: time by which the wall clock was ahead of the log's
+    wall-clock times then. `continued`: as the file was full, and the log goes on in another part.
     `complete`: its index is there. `continues`: the former part. `damage`: what of the file is lost.
     """
 
@@ -131,6 +132,7 @@ class LogSummary(msgspec.Struct, frozen=True):
     complete: bool
     ended: bool | None
     end: str
+    wall_clock_change_s: float
     continued: bool
     continues: str
     robot: str
@@ -285,6 +287,9 @@ class Log:
         # A part that continues another holds ticks from before it was begun.
         start_ns = min(self.metadata.start_ns, first) if ticks else self.metadata.start_ns
         ending = self.ending
+        offset_ns = end_offset_ns = self.metadata.wall_offset_ns
+        if ending is not None and ending.wall_offset_ns is not None:
+            end_offset_ns = ending.wall_offset_ns
         if ending is not None:
             missing += max(0, ending.sequence - (self._last_tick or self.metadata.continues_sequence or 0))
         return LogSummary(
@@ -292,13 +297,14 @@ class Log:
             bytes=self._contents.size,
             complete=self.complete,
             ended=True if ending is not None else False if self.metadata.format >= FORMAT else None,
-            end=_iso((last if ending is None else ending.t_ns) + self.metadata.wall_offset_ns),
+            end=_iso((last if ending is None else ending.t_ns) + end_offset_ns),
+            wall_clock_change_s=(end_offset_ns - offset_ns) * 1e-9,
             continued=ending is not None and ending.continued,
             continues=self.metadata.continues,
             robot=self.metadata.robot,
             version=self.metadata.version,
             part=self.metadata.part,
-            start=_iso(start_ns + self.metadata.wall_offset_ns),
+            start=_iso(start_ns + offset_ns),
             duration_s=duration_s,
             ticks=ticks,
             missing_ticks=missing,
