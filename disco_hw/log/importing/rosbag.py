@@ -31,7 +31,7 @@ from disco_hw.log.drive import (
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, continuous_wheels, restarts
 from disco_hw.log.importing.csv_drive import length_fault
-from disco_hw.log.importing.losses import WARNING, loss_note
+from disco_hw.log.importing.losses import WARNING, loss_note, unknown_commands_note
 from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, message_of, open_bag
 from disco_hw.log.importing.rosbag_times import Column, alike, timeline
 from disco_hw.log.importing.rosbag_topics import (
@@ -175,6 +175,9 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, Column], robot: Ro
             f"{breaks_ns.size} times the wheels paused, or a clock or encoder was set; new segments begin there"
         )
     drive = drive_of(str(path), (command_ns, command), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, measured)
+    times_s = np.unique(np.concatenate([drive.commands.t_s, drive.wheels.t_s, drive.poses.t_s]))
+    why = f"as each counts for {LONGEST_COMMAND_S:g} s at most"
+    notes += unknown_commands_note(str(path), times_s, drive.commands, drive.wheels, why)
     fault = length_fault(drive.poses, drive.wheels, drive.commands, robot.wheel_radius_m)
     if fault is not None:
         notes.append(f"poses and wheels do not fit together: {fault.rpartition(';')[0]}; see which topics were read")

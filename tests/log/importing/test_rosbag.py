@@ -142,6 +142,19 @@ def test_a_clock_that_is_set_is_said_and_taken_out(path, by_s):
     assert drive.poses.t_s[-1] == pytest.approx(drive.wheels.t_s[-1], abs=0.2)
 
 
+def test_commands_that_run_out_while_the_wheels_turn_are_named(path):
+    """A joystick publishes on change: a command counts for half a second, and what holds it longer is not known."""
+
+    def write(maker, k):
+        maker.wheels(k)
+        if k % 100 < 10:
+            maker.write("/cmd_vel", maker.twist(0.1 * (k % 100), 0.0), time_ns(k))
+
+    drive = read_bag(path, 400, write)
+    assert has_note(drive, "commands: none is known for 5.3 of 8.0 s in which the wheels turn")
+    assert any(note.startswith("warning: ") and "5.3 of 8.0 s" in note for note in drive.notes)
+
+
 def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(path):
     """A simulation at half the speed of time, whose clock began at 100 s."""
     start_s = 100.0 - BEGAN_NS * 1e-9
