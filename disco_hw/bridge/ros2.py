@@ -223,7 +223,8 @@ class Bridge:
 
     def _handle_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
         publisher = _publisher_of(message)
-        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static, publisher=publisher):
+        now_ns = time.monotonic_ns(), time.time_ns()
+        for pose in self._transforms.poses(message, sent_ns, *now_ns, static=static, publisher=publisher):
             self._handle_pose(pose, sent_ns)
 
     def _handle_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
