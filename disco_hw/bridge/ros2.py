@@ -154,6 +154,7 @@ class Bridge:
         # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.freeze()
+        self._take_over_obstacles()
         inward = threading.Thread(target=self._receive, name="in", daemon=True)
         inward.start()
         try:
@@ -255,6 +256,11 @@ class Bridge:
             except OSError:
                 # As with poses: the next report is worth more.
                 self._obstacles_unsent += 1
+
+    def _take_over_obstacles(self) -> None:
+        """Take over what a bridge before this one reported, as only a bridge can say when it is gone."""
+        known = self._request_status().get("area", {}).get("obstacles", ())
+        self._obstacles.take_over({one["name"]: one["age_s"] for one in known}, time.time_ns())
 
     def _handle_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
         now_ns = time.monotonic_ns()

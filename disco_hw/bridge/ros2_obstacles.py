@@ -5,13 +5,15 @@ the JSON that goes over UDP, for a sender that has the standard messages alone.
 
 An id names an obstacle if it is positive and the only one in its array. Obstacles with other ids (costmap_converter
 leaves 0, or writes -1) are numbered; those that the sender's next array lacks are gone, as it holds all that is seen.
+What a bridge before this one numbered is taken over from the daemon.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 
 import msgspec
 
@@ -27,6 +29,9 @@ _OLDEST_NS = 1_000_000_000
 _REMOVAL_NS = 2_000_000_000
 # Chosen: far above MOST_OBSTACLES; senders with ever new ids must not fill the memory.
 _MOST_UNNAMED = 1000
+_NAME = re.compile(r"ros2\.(-?\d+)(?:\.(\d+))?")
+# Stands for the publishers that a bridge before this one received.
+_BEFORE = "before"
 
 
 class ObstacleInlet:
@@ -62,6 +67,16 @@ class ObstacleInlet:
             gone = self._gone_since(message, sent_ns, wall_ns, publisher)
         self.passed += len(reports)
         return [msgspec.json.encode(one) for one in (*reports, *gone)]
+
+    def take_over(self, ages_s: Mapping[str, float], wall_ns: int) -> None:
+        """Take over the numbered obstacles of a bridge before this one: all obstacles by name, with their age in s."""
+        for name, age_s in ages_s.items():
+            found = _NAME.fullmatch(name)
+            if found is None:
+                continue
+            number, k = int(found[1]), int(found[2] or 1)
+            if number <= 0 or k > 1 or _name(number, 2) in ages_s:
+                self._unnamed[number, k] = _BEFORE, wall_ns - round(age_s * 1e9)
 
     def _in_text(self, message: msg.String) -> Sequence[ObstacleReport]:
         try:

@@ -10,10 +10,11 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from disco_hw.bridge import ros2
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import Bridge
 from disco_hw.bridge.ros2_obstacles import TOPIC, ObstacleInlet
-from disco_hw.runtime.obstacles import MOST_OBSTACLES, obstacle_source_of, reports_in
+from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport, Obstacles, obstacle_source_of, reports_in
 from disco_hw.runtime.robot_setup import load_setup
 from tests.drivers.waiting import free_port
 from tests.first_use.miswired import robot_file
@@ -163,6 +164,26 @@ def test_a_sender_that_restarts_takes_over_the_numbered_obstacles_of_before():
     assert later_array(2, 0.5, inlet, "restarted") == []
     # A removal is repeated, as a datagram can be lost.
     assert [later_array(2, at_s, inlet, "restarted") for at_s in (1.5, 3.0)] == 2 * [["ros2.0.3", "ros2.0.4"]]
+
+
+def test_a_bridge_that_restarts_takes_over_the_numbered_obstacles_that_the_daemon_has(tmp_path, monkeypatch):
+    known = Obstacles()
+    for name in ("ros2.0", "ros2.0.2", "ros2.0.3", "ros2.-1", "ros2.9", "ros2.9.2", "ros2.7", "cart", "ros2.x"):
+        known.report(0, ObstacleReport(name=name, x_m=0.0, y_m=0.0, radius_m=1.0))
+    status = {"area": {"obstacles": known.status(1_500 * MS)}}
+    monkeypatch.setattr(ros2, "send_request", lambda _, __: status)
+    monkeypatch.setattr(time, "time_ns", lambda: WALL_NS)
+    # Without a domain of DDS, which takes a second to join.
+    bridge = Bridge.__new__(Bridge)
+    bridge._config = load_setup(robot_file(tmp_path)).config
+    bridge._obstacles = ObstacleInlet("map")
+    bridge._take_over_obstacles()
+    # A track, and what another program reports, is not the bridge's to remove.
+    removed = later_array(1, 0.1, bridge._obstacles, "sender")
+    assert set(removed) == {"ros2.0.2", "ros2.0.3", "ros2.-1", "ros2.9", "ros2.9.2"}
+    # A daemon that does not answer has none.
+    status.clear()
+    bridge._take_over_obstacles()
 
 
 def test_a_sender_that_is_silent_loses_nothing_to_one_that_was_there_beside_it():
