@@ -107,7 +107,7 @@ class DriveLog:
 
     Times start near 0 and increase within each array. Nothing may be predicted across a change of `segment`, which has
     the same numbers in all arrays. `notes` say what was ignored or filled in, for a person. `begins_s`: when each of
-    several drives begins.
+    several drives begins. `began_ns`: time 0 by the clock of the source, 0 where it is not known.
     """
 
     sources: tuple[str, ...]
@@ -117,6 +117,7 @@ class DriveLog:
     gyro: Gyro = field(default_factory=Gyro)
     notes: tuple[str, ...] = ()
     begins_s: tuple[float, ...] = (0.0,)
+    began_ns: int = 0
 
     @property
     def end_s(self) -> float:
@@ -207,6 +208,7 @@ def drive_of(
         wheels=Wheels(wheel_s, left, right, left_speed, right_speed, segment, has_angle, has_speed),
         poses=Poses(pose_s, poses[1][:, 0], poses[1][:, 1], poses[1][:, 2], pose_segment),
         notes=tuple(notes),
+        began_ns=int(began_ns),
     )
 
 

@@ -74,12 +74,10 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
     """Write commands, wheels and poses of a log as a bag of ROS 2; raises LogError, InputError without `rosbags`."""
     with open_log(path) as log:
         drive = drive_from_log(log)
-        times = (log.columns(topic).get("t_ns") for topic in ("/command", "/wheels", "/pose"))
-        first_ns = min(int(t_ns.min()) for t_ns in times if t_ns is not None and t_ns.size)
         robot = nominal_robot(log)
         radius_m, axial_m = robot.get("wheel_radius_m"), robot.get("axial_distance_m")
         geometry = None if radius_m is None or axial_m is None else (radius_m, axial_m)
-        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, geometry)
+        messages = write_rosbag(drive, out, drive.began_ns + log.metadata.wall_offset_ns, geometry)
     return _exported(out, "messages", messages, drive, as_json)
 
 

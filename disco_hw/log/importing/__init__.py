@@ -78,7 +78,7 @@ _Timed = tuple[int, int, Record]
 
 
 def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attachment, ...] = ()) -> int:
-    """Write a new log and return how many records it has; its time 0 is the drive's.
+    """Write a new log and return how many records it has; its time 0 is the drive's, and so is its date if known.
 
     A change of segment leaves out one tick's number. Raises LogError if the file exists or cannot be
     written.
@@ -95,7 +95,7 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
     try:
         angle, speed = drive.wheels.angle_measured, drive.wheels.speed_measured
         start = Start(
-            str(path), robot, version(), 0, 0, part=0, attachments=attachments,
+            str(path), robot, version(), 0, max(0, drive.began_ns), part=0, attachments=attachments,
             angle_measured=angle, speed_measured=speed,
         )  # fmt: skip
         log = McapLog(file, start)
