@@ -312,17 +312,26 @@ class Motion:
 
 
 def chain(edges: Iterable[Edge], map_frame: str, base_frame: str) -> tuple[Edge, ...] | None:
-    """Return the edges from map to base, in this order, or None; each child has one parent, as tf demands."""
-    parents = {child: parent for parent, child in edges}
+    """Return the edges from map to base, in this order, or None.
+
+    Of several parents of a frame, which tf does not allow, the first counts that leads there.
+    """
+    parents: dict[str, list[str]] = {}
+    for parent, child in edges:
+        parents.setdefault(child, []).append(parent)
+    child_of: dict[str, str] = {}
+    frames = [base_frame]
+    for frame in frames:
+        new = [one for one in parents.get(frame, ()) if one not in child_of and one != base_frame]
+        child_of |= dict.fromkeys(new, frame)
+        frames += new
+    if map_frame not in child_of:
+        return None
     found: list[Edge] = []
-    frame = base_frame
-    while frame != map_frame:
-        parent = parents.get(frame)
-        # As many steps as frames: what comes after is a circle.
-        if parent is None or len(found) > len(parents):
-            return None
-        found.insert(0, (parent, frame))
-        frame = parent
+    frame = map_frame
+    while frame != base_frame:
+        found.append((frame, child_of[frame]))
+        frame = child_of[frame]
     return tuple(found)
 
 

@@ -108,8 +108,8 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
             columns[role] = Column(width)
             takes.setdefault(used.topic, []).append((role, read_row))
     by_tf = choice.used(POSES) is not None and POSES not in columns
-    edges = {edge: Column(7) for edge in choice.edges} if by_tf else {}
-    static: set[Edge] = set()
+    # An edge that moves may have been latched, too, before it did.
+    edges = {edge: (Column(7), Column(7)) for edge in choice.edges} if by_tf else {}
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
     for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
         if number >= _MOST_MESSAGES:
@@ -126,12 +126,11 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
             for one in message.value.transforms:
                 edge = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
                 if edge in edges:
-                    edges[edge].add(
+                    edges[edge][message.topic.endswith("static")].add(
                         message.log_ns, stamp_of(one), finite(_place(one.transform.translation, one.transform.rotation))
                     )
-                    if message.topic.endswith("static"):
-                        static.add(edge)
-    return columns | {_edge_name(edge, edge in static): column for edge, column in edges.items()}
+    is_static = {edge: not moving.log_ns for edge, (moving, _) in edges.items()}
+    return columns | {_edge_name(edge, is_static[edge]): both[is_static[edge]] for edge, both in edges.items()}
 
 
 def _edge_name(edge: Edge, static: bool) -> str:
