@@ -179,7 +179,8 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
     gyro = Gyro(t_s[turning], rate[turning, 0], segment[turning])
     if not (np.isfinite(commands.left_rad_s).any() or wheels.t_s.size or poses.t_s.size):
         raise LogError(f"{path}: no row has a command, an encoder sample or a pose; nothing was driven in it")
-    return DriveLog((str(path),), commands, wheels, poses, gyro, warnings_first((*sheet.notes, *notes)))
+    notes_first = warnings_first((*sheet.notes, *notes))
+    return DriveLog((str(path),), commands, wheels, poses, gyro, notes_first, began_ns=round(sheet.begin_s * 1e9))
 
 
 def _commands(sheet: Sheet, wheels: Wheels, notes: list[str]) -> Commands:
