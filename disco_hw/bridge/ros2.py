@@ -250,7 +250,8 @@ class Bridge:
 
     def _handle_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
         fence = self._config.fence
-        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns(), _publisher_of(message)):
+        now_ns = time.monotonic_ns(), time.time_ns()
+        for datagram in self._obstacles.datagrams(message, sent_ns, *now_ns, _publisher_of(message)):
             try:
                 self._obstacle_link.sendto(datagram, (fence.obstacles_address, fence.obstacles_port))
             except OSError:
@@ -260,7 +261,7 @@ class Bridge:
     def _take_over_obstacles(self) -> None:
         """Take over what a bridge before this one reported, as only a bridge can say when it is gone."""
         known = self._request_status().get("area", {}).get("obstacles", ())
-        self._obstacles.take_over({one["name"]: one["age_s"] for one in known}, time.time_ns())
+        self._obstacles.take_over({one["name"]: one["age_s"] for one in known}, time.monotonic_ns())
 
     def _handle_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
         now_ns = time.monotonic_ns()
