@@ -148,6 +148,15 @@ def read_contents(fd: int, name: str) -> Contents:
         return contents
 
 
+def read_profile(fd: int) -> str:
+    """Return the profile in the header of an MCAP file, "ros2" for a bag; empty where the header is damaged."""
+    try:
+        opcode, length = _HEAD.unpack(_content(fd, len(MAGIC), _HEAD.size))
+        return _parse(Header, _content(fd, len(MAGIC) + _HEAD.size, length)).profile if opcode == Opcode.HEADER else ""
+    except DamagedError:
+        return ""
+
+
 def _walked(fd: int, size: int) -> tuple[Contents, bool]:
     """Contents from walking the file, with every chunk checked, and whether its data came to their end.
 

@@ -27,11 +27,12 @@ from disco_hw.log.container import (
     read_attachment,
     read_chunk,
     read_contents,
+    read_profile,
 )
 from disco_hw.log.drive import DriveLog, rows
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import drive_from_log, nominal_robot
-from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
+from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, RECOVERY
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.records import Controller
 from drivers.types import SOURCE_TEXTS, Identity, SaidBy
@@ -187,13 +188,13 @@ def recover_log(source: Path, target: Path) -> Recovered:
 
 def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
     all_damage = list(contents.damage)
-    writer.start(profile=PROFILE, library=LIBRARY)
+    writer.start(profile=read_profile(fd), library=LIBRARY)
     for metadata in contents.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
     attachments = 0
     for ref in contents.attachments:
         try:
-            writer.add_attachment(ref.log_time, ref.log_time, ref.name, ref.media_type, read_attachment(fd, ref))
+            writer.add_attachment(ref.create_time, ref.log_time, ref.name, ref.media_type, read_attachment(fd, ref))
             attachments += 1
         except DamagedError as damage:
             all_damage.append(str(damage))
