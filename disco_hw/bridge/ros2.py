@@ -154,6 +154,7 @@ class Bridge:
         # Neither thread waits long for the other's Python, and what was imported is not looked through for garbage.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         gc.freeze()
+        self._take_over_obstacles()
         inward = threading.Thread(target=self._receive, name="in", daemon=True)
         inward.start()
         try:
@@ -223,7 +224,8 @@ class Bridge:
 
     def _handle_transforms(self, message: msg.TFMessage, sent_ns: int, *, static: bool = False) -> None:
         publisher = _publisher_of(message)
-        for pose in self._transforms.poses(message, sent_ns, time.time_ns(), static=static, publisher=publisher):
+        now_ns = time.monotonic_ns(), time.time_ns()
+        for pose in self._transforms.poses(message, sent_ns, *now_ns, static=static, publisher=publisher):
             self._handle_pose(pose, sent_ns)
 
     def _handle_static_transforms(self, message: msg.TFMessage, sent_ns: int) -> None:
@@ -248,12 +250,18 @@ class Bridge:
 
     def _handle_obstacles(self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int) -> None:
         fence = self._config.fence
-        for datagram in self._obstacles.datagrams(message, sent_ns, time.time_ns(), _publisher_of(message)):
+        now_ns = time.monotonic_ns(), time.time_ns()
+        for datagram in self._obstacles.datagrams(message, sent_ns, *now_ns, _publisher_of(message)):
             try:
                 self._obstacle_link.sendto(datagram, (fence.obstacles_address, fence.obstacles_port))
             except OSError:
                 # As with poses: the next report is worth more.
                 self._obstacles_unsent += 1
+
+    def _take_over_obstacles(self) -> None:
+        """Take over what a bridge before this one reported, as only a bridge can say when it is gone."""
+        known = self._request_status().get("area", {}).get("obstacles", ())
+        self._obstacles.take_over({one["name"]: one["age_s"] for one in known}, time.monotonic_ns())
 
     def _handle_speed(self, message: msg.Twist | msg.TwistStamped, sent_ns: int) -> None:
         now_ns = time.monotonic_ns()

@@ -142,15 +142,27 @@ class TransformInlet:
         self._map, self._base = _frame(settings.frame), _frame(base_frame)
         self._edges: dict[str, _Followed] = {}
         self._chain: tuple[Edge, ...] | None = None
-        self._received_ns = 0
+        self._received_ns = self._wall_offset_ns = 0
 
     def poses(
-        self, message: msg.TFMessage, sent_ns: int, wall_ns: int, *, static: bool, publisher: Hashable = None
+        self,
+        message: msg.TFMessage,
+        sent_ns: int,
+        mono_ns: int,
+        wall_ns: int,
+        *,
+        static: bool,
+        publisher: Hashable = None,
     ) -> Iterator[msg.PoseWithCovarianceStamped]:
         """Yield the poses that the transforms of a message bring; `sent_ns` is the time of those without a stamp.
 
         `publisher`: who sent it; of several that move one edge the first counts, until it has been silent.
         """
+        if wall_ns - mono_ns < self._wall_offset_ns - AHEAD_NS:
+            # This computer's clock was set back: what comes now is newer than what came before.
+            self._edges = {child: edge for child, edge in self._edges.items() if edge.static}
+            self._chain = None
+        self._wall_offset_ns = wall_ns - mono_ns
         for each in message.transforms:
             parent, child = _frame(each.header.frame_id), _frame(each.child_frame_id)
             place, turned = each.transform.translation, each.transform.rotation
@@ -161,10 +173,10 @@ class TransformInlet:
                 self.refused["transforms that are not finite, or no rotation"] += 1
             elif before is None and len(self._edges) >= _MOST_EDGES:
                 self.refused["transforms of too many frames"] += 1
-            elif not static and not self._publishers_of(child).may_send(publisher, wall_ns):
+            elif not static and not self._publishers_of(child).may_send(publisher, mono_ns):
                 self.refused["transforms of a second publisher of the same edge"] += 1
             elif self._keep(parent, child, t_ns, values, static=static):
-                self._publishers_of(child).note_pose(publisher, wall_ns)
+                self._publishers_of(child).note_pose(publisher, mono_ns)
                 pose = self._pose_by(child, wall_ns)
                 if pose is not None:
                     yield pose

@@ -5,13 +5,15 @@ the JSON that goes over UDP, for a sender that has the standard messages alone.
 
 An id names an obstacle if it is positive and the only one in its array. Obstacles with other ids (costmap_converter
 leaves 0, or writes -1) are numbered; those that the sender's next array lacks are gone, as it holds all that is seen.
+What a bridge before this one numbered is taken over from the daemon.
 """
 
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 
 import msgspec
 
@@ -27,6 +29,9 @@ _OLDEST_NS = 1_000_000_000
 _REMOVAL_NS = 2_000_000_000
 # Chosen: far above MOST_OBSTACLES; senders with ever new ids must not fill the memory.
 _MOST_UNNAMED = 1000
+_NAME = re.compile(r"ros2\.(-?\d+)(?:\.(\d+))?")
+# Stands for the publishers that a bridge before this one received.
+_BEFORE = "before"
 
 
 class ObstacleInlet:
@@ -46,7 +51,12 @@ class ObstacleInlet:
         """When each publisher's first whole array came."""
 
     def datagrams(
-        self, message: msg.ObstacleArrayMsg | msg.String, sent_ns: int, wall_ns: int, publisher: Hashable = None
+        self,
+        message: msg.ObstacleArrayMsg | msg.String,
+        sent_ns: int,
+        mono_ns: int,
+        wall_ns: int,
+        publisher: Hashable = None,
     ) -> list[bytes]:
         """Return the datagrams to send for a message received now, one for each obstacle and each that is gone.
 
@@ -59,9 +69,19 @@ class ObstacleInlet:
             reports = self._in_text(message)
         else:
             reports = self._in_array(message, sent_ns, wall_ns)
-            gone = self._gone_since(message, sent_ns, wall_ns, publisher)
+            gone = self._gone_since(message, sent_ns, mono_ns, wall_ns, publisher)
         self.passed += len(reports)
         return [msgspec.json.encode(one) for one in (*reports, *gone)]
+
+    def take_over(self, ages_s: Mapping[str, float], mono_ns: int) -> None:
+        """Take over the numbered obstacles of a bridge before this one: all obstacles by name, with their age in s."""
+        for name, age_s in ages_s.items():
+            found = _NAME.fullmatch(name)
+            if found is None:
+                continue
+            number, k = int(found[1]), int(found[2] or 1)
+            if number <= 0 or k > 1 or _name(number, 2) in ages_s:
+                self._unnamed[number, k] = _BEFORE, mono_ns - round(age_s * 1e9)
 
     def _in_text(self, message: msg.String) -> Sequence[ObstacleReport]:
         try:
@@ -101,20 +121,20 @@ class ObstacleInlet:
         return age_ns, ""
 
     def _gone_since(
-        self, message: msg.ObstacleArrayMsg, sent_ns: int, wall_ns: int, publisher: Hashable
+        self, message: msg.ObstacleArrayMsg, sent_ns: int, mono_ns: int, wall_ns: int, publisher: Hashable
     ) -> list[ObstacleReport]:
         """Return a removal of each numbered obstacle of this publisher that its array lacks; none for a refused one."""
         # An empty array is of its header's frame and time.
         if any(self._age_of(one, message, sent_ns, wall_ns)[1] for one in message.obstacles or [msg.ObstacleMsg()]):
             return []
-        first_ns = self._first_ns.setdefault(publisher, wall_ns)
+        first_ns = self._first_ns.setdefault(publisher, mono_ns)
         for key, (_, reported_ns) in self._unnamed.items():
-            if reported_ns < first_ns and wall_ns - reported_ns > _OLDEST_NS:
-                self._unnamed[key] = (publisher, wall_ns)
+            if reported_ns < first_ns and mono_ns - reported_ns > _OLDEST_NS:
+                self._unnamed[key] = (publisher, mono_ns)
         counts = Counter(one.id for one in message.obstacles)
         gone = [key for key, (sender, _) in self._unnamed.items() if sender == publisher and key[1] > counts[key[0]]]
         for key in gone:
-            if wall_ns - self._unnamed[key][1] > _REMOVAL_NS:
+            if mono_ns - self._unnamed[key][1] > _REMOVAL_NS:
                 del self._unnamed[key]
         if len(self._unnamed) > _MOST_UNNAMED:
             self._unnamed.clear()
@@ -123,7 +143,7 @@ class ObstacleInlet:
         for number, count in counts.items():
             if number <= 0 or count > 1 or (number, 1) in self._unnamed:
                 reported = range(1, min(count, MOST_OBSTACLES) + 1)
-                self._unnamed.update({(number, k): (publisher, wall_ns) for k in reported})
+                self._unnamed.update({(number, k): (publisher, mono_ns) for k in reported})
         return [
             ObstacleReport(name=_name(number, k), x_m=0.0, y_m=0.0, radius_m=1.0, removed=True) for number, k in gone
         ]

@@ -34,7 +34,10 @@ _WATCHED_FAN_NS = _SECOND_NS // 2
 # Chosen: enough to see where the plans go; each costs time of the tick and space in the log.
 _FAN_PATHS = 16
 
-_SUSPENDED = "this computer was suspended: the robot is disarmed, and the link begins anew"
+_SUSPENDED = (
+    "this computer was suspended for {:.3g} s: the robot is disarmed, and the link begins anew; from here on "
+    "wall-clock times in the log are that much too early"
+)
 
 Report = Callable[[str, str], None]
 
@@ -175,11 +178,12 @@ class Daemon:
                 self._change_area(now_ns, message)
         desired = self._pilot.step(now_ns, self._core.last)
         events = tuple(records.Event(now_ns, "info", "drive", text) for text in desired.events)
-        if self._suspend_watch.was_suspended():
+        if suspended_s := self._suspend_watch.suspended_s():
             # No age shows it, and a driver would go on commanding what its controller has stopped since.
             self._core.renew_link()
-            self._report("link", _SUSPENDED)
-            events = (*events, records.Event(now_ns, "warning", "link", _SUSPENDED))
+            text = _SUSPENDED.format(suspended_s)
+            self._report("link", text)
+            events = (*events, records.Event(now_ns, "warning", "link", text))
         mark("control")
         tick = self._core.tick(
             now_ns,

@@ -45,13 +45,16 @@ class SuspendWatch:
         monotonic_ns = read_ns(time.CLOCK_MONOTONIC)
         self._apart_ns = read_ns(time.CLOCK_BOOTTIME) - monotonic_ns
 
-    def was_suspended(self) -> bool:
-        """Whether the computer was suspended since the last call; a thread that was held up is never taken for that."""
+    def suspended_s(self) -> float:
+        """Return for how long the computer was suspended since the last call (s), 0 if it was not.
+
+        A thread that was held up is never taken for that.
+        """
         boot_ns = self._read_ns(time.CLOCK_BOOTTIME)
         apart_ns = boot_ns - self._read_ns(time.CLOCK_MONOTONIC)
-        was_suspended = apart_ns - self._apart_ns > _SUSPENDED_NS
+        suspended_ns = apart_ns - self._apart_ns
         self._apart_ns = max(apart_ns, self._apart_ns)
-        return was_suspended
+        return suspended_ns * 1e-9 if suspended_ns > _SUSPENDED_NS else 0.0
 
 
 # Leading binary digits that a bucket keeps, so that it is at most 1/64 wide.

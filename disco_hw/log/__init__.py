@@ -95,16 +95,18 @@ Time64 = Annotated[int, msgspec.Meta(ge=-(2**63) + 1, le=2**63 - 1)]
 """A time or an offset of times, ns, in the 64 bits that a log has for it."""
 
 
-class End(msgspec.Struct, frozen=True):
+class End(msgspec.Struct, frozen=True, omit_defaults=True):
     """The recorder's last word: when it ended (monotonic), the last tick's number, and how many ticks it dropped.
 
-    `continued`: the file is full, and the recorder goes on in another part.
+    `continued`: the file is full, and the recorder goes on in another part. `wall_offset_ns`: wall-clock time minus
+    monotonic time then, None if that was not recorded.
     """
 
     t_ns: Time64
     sequence: Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]
     dropped_ticks: int
     continued: bool = False
+    wall_offset_ns: Time64 | None = None
 
 
 class WriterStatus(msgspec.Struct, frozen=True):

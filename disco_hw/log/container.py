@@ -28,6 +28,7 @@ from mcap.records import (
     Chunk,
     ChunkIndex,
     Footer,
+    Header,
     Metadata,
     MetadataIndex,
     Schema,
@@ -56,6 +57,14 @@ _SEARCH_BYTES = 1024 * 1024
 _CHUNK_MARK = b"\x04\x00\x00\x00zstd"
 _CHUNK_MARK_AT = _HEAD.size + 8 + 8 + 8 + 4
 _FRONT_MATTER = (Opcode.ATTACHMENT, Opcode.METADATA, Opcode.HEADER)
+_DATA_SECTION = (*_FRONT_MATTER, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX)
+_DATA_END_BYTES = 4
+_SELF_DELIMITING: dict[int, type[object]] = {
+    Opcode.HEADER: Header,
+    Opcode.SCHEMA: Schema,
+    Opcode.CHANNEL: Channel,
+    Opcode.METADATA: Metadata,
+}
 _DESCRIPTIONS: dict[int, type[object]] = {
     Opcode.SCHEMA: Schema,
     Opcode.CHANNEL: Channel,
@@ -139,6 +148,15 @@ def read_contents(fd: int, name: str) -> Contents:
         return contents
 
 
+def read_profile(fd: int) -> str:
+    """Return the profile in the header of an MCAP file, "ros2" for a bag; empty where the header is damaged."""
+    try:
+        opcode, length = _HEAD.unpack(_content(fd, len(MAGIC), _HEAD.size))
+        return _parse(Header, _content(fd, len(MAGIC) + _HEAD.size, length)).profile if opcode == Opcode.HEADER else ""
+    except DamagedError:
+        return ""
+
+
 def _walked(fd: int, size: int) -> tuple[Contents, bool]:
     """Contents from walking the file, with every chunk checked, and whether its data came to their end.
 
@@ -146,31 +164,43 @@ def _walked(fd: int, size: int) -> tuple[Contents, bool]:
     """
     contents = Contents(size=size)
     offset, unlisted, ended = len(MAGIC), 0, False
+    before = offset
     while offset < size and not ended:
         head = _read(fd, offset, _HEAD.size)
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
         follows = offset + _HEAD.size + length
-        ended = opcode == Opcode.DATA_END
+        ended = opcode == Opcode.DATA_END and length == _DATA_END_BYTES
         try:
-            if not Opcode.HEADER <= opcode <= Opcode.DATA_END:
+            if opcode not in _DATA_SECTION and not ended:
                 raise DamagedError("no record")
             if follows > size and not ended:
                 raise DamagedError("an unfinished record")
             _index_record(fd, contents, opcode, offset, length)
         except DamagedError as damage:
-            if opcode not in _FRONT_MATTER or follows > size:
-                # Of a damaged chunk the length is in doubt as well.
-                follows = _next_chunk(fd, offset + 1, size) or size
+            place = offset
+            if opcode not in _FRONT_MATTER or not _is_followed(fd, follows, size):
+                # Of a damaged chunk the length is in doubt as well, and where no record is, that of the one before.
+                follows = _next_chunk(fd, (offset if opcode in _DATA_SECTION else before) + 1, size) or size
+                place = offset if follows > offset else before
             if len(contents.damage) < _MOST_DAMAGE:
-                contents.damage.append(f"at byte {offset}: {damage}; {follows - offset} bytes are lost")
+                contents.damage.append(f"at byte {place}: {damage}; {follows - place} bytes are lost")
             else:
                 unlisted += 1
-        offset = follows
+        before, offset = offset, follows
     if unlisted:
         contents.damage.append(f"at {unlisted} further places something is lost")
     if not ended:
         contents.damage.append("the end is missing: the writer was killed or is still at work, or the file was cut")
     return contents, ended
+
+
+def _is_followed(fd: int, offset: int, size: int) -> bool:
+    """Return whether a record, or the end of the file, is at this place."""
+    head = _read(fd, offset, _HEAD.size)
+    if len(head) < _HEAD.size:
+        return offset == size
+    opcode, length = _HEAD.unpack(head)
+    return opcode in (*_DATA_SECTION, Opcode.DATA_END) and offset + _HEAD.size + length <= size
 
 
 def _next_chunk(fd: int, start: int, size: int) -> int | None:
@@ -346,6 +376,8 @@ def _refuse_useless_index(contents: Contents, has_counts: bool, compressions: se
 
 def _index_record(fd: int, contents: Contents, opcode: int, offset: int, length: int) -> None:
     """Note the top-level record at `offset`, whose content has this length; raises DamagedError."""
+    if opcode in _DATA_SECTION and length != _length_within(fd, opcode, offset + _HEAD.size, length):
+        raise DamagedError("a record of a wrong length")
     if opcode == Opcode.CHUNK:
         _index_chunk(fd, contents, offset + _HEAD.size, length)
     elif opcode == Opcode.ATTACHMENT:
@@ -357,6 +389,21 @@ def _index_record(fd: int, contents: Contents, opcode: int, offset: int, length:
         )
     elif opcode == Opcode.METADATA:
         contents.metadata.append(_parse(Metadata, _content(fd, offset + _HEAD.size, length)))
+
+
+def _length_within(fd: int, opcode: int, offset: int, length: int) -> int:
+    """Return the length of a record's content by what is in it, where that says one."""
+    if opcode == Opcode.MESSAGE_INDEX:
+        return 6 + int.from_bytes(_read(fd, offset + 2, 4), "little")
+    if opcode == Opcode.CHUNK:
+        name = int.from_bytes(_read(fd, offset + 28, 4), "little")
+        return 40 + name + int.from_bytes(_read(fd, offset + 32 + name, 8), "little")
+    kind = _SELF_DELIMITING.get(opcode)
+    if kind is None:
+        return length
+    content = BytesIO(_content(fd, offset, length))
+    _parse(kind, content)
+    return content.tell()
 
 
 def _index_chunk(fd: int, contents: Contents, offset: int, length: int) -> None:
@@ -403,9 +450,9 @@ def _read(fd: int, offset: int, length: int) -> bytes:
     return b"".join(parts)
 
 
-def _parse(record: type[_T], content: bytes) -> _T:
+def _parse(record: type[_T], content: bytes | BytesIO) -> _T:
     read: Callable[[Any], _T] = record.read  # type: ignore[attr-defined]
     try:
-        return read(ReadDataStream(BytesIO(content)))
+        return read(ReadDataStream(content if isinstance(content, BytesIO) else BytesIO(content)))
     except _PARSE_ERRORS as error:
         raise DamagedError(f"a {record.__name__.lower()} record that cannot be read ({error})") from None

@@ -107,7 +107,7 @@ class DriveLog:
 
     Times start near 0 and increase within each array. Nothing may be predicted across a change of `segment`, which has
     the same numbers in all arrays. `notes` say what was ignored or filled in, for a person. `begins_s`: when each of
-    several drives begins.
+    several drives begins. `began_ns`: time 0 by the clock of the source, 0 where it is not known.
     """
 
     sources: tuple[str, ...]
@@ -117,6 +117,7 @@ class DriveLog:
     gyro: Gyro = field(default_factory=Gyro)
     notes: tuple[str, ...] = ()
     begins_s: tuple[float, ...] = (0.0,)
+    began_ns: int = 0
 
     @property
     def end_s(self) -> float:
@@ -207,6 +208,7 @@ def drive_of(
         wheels=Wheels(wheel_s, left, right, left_speed, right_speed, segment, has_angle, has_speed),
         poses=Poses(pose_s, poses[1][:, 0], poses[1][:, 1], poses[1][:, 2], pose_segment),
         notes=tuple(notes),
+        began_ns=int(began_ns),
     )
 
 
@@ -310,17 +312,26 @@ class Motion:
 
 
 def chain(edges: Iterable[Edge], map_frame: str, base_frame: str) -> tuple[Edge, ...] | None:
-    """Return the edges from map to base, in this order, or None; each child has one parent, as tf demands."""
-    parents = {child: parent for parent, child in edges}
+    """Return the edges from map to base, in this order, or None.
+
+    Of several parents of a frame, which tf does not allow, the first counts that leads there.
+    """
+    parents: dict[str, list[str]] = {}
+    for parent, child in edges:
+        parents.setdefault(child, []).append(parent)
+    child_of: dict[str, str] = {}
+    frames = [base_frame]
+    for frame in frames:
+        new = [one for one in parents.get(frame, ()) if one not in child_of and one != base_frame]
+        child_of |= dict.fromkeys(new, frame)
+        frames += new
+    if map_frame not in child_of:
+        return None
     found: list[Edge] = []
-    frame = base_frame
-    while frame != map_frame:
-        parent = parents.get(frame)
-        # As many steps as frames: what comes after is a circle.
-        if parent is None or len(found) > len(parents):
-            return None
-        found.insert(0, (parent, frame))
-        frame = parent
+    frame = map_frame
+    while frame != base_frame:
+        found.append((frame, child_of[frame]))
+        frame = child_of[frame]
     return tuple(found)
 
 

@@ -43,6 +43,8 @@ def drive_from_log(log: Log) -> DriveLog:
         notes,
     )
     pose_ns, pose = _poses(log, notes)
+    if log.ending is not None and log.ending.continued:
+        notes.append(f"{log.path}: was full, and goes on in the next part, which is a log of its own")
     if not (command_ns.size or wheel_ns.size or pose_ns.size):
         raise LogError(f"{log.path}: holds no command, wheel sample or pose; nothing was driven in it")
     breaks_ns = _breaks(log, wheel_ns, notes)

@@ -27,11 +27,12 @@ from disco_hw.log.container import (
     read_attachment,
     read_chunk,
     read_contents,
+    read_profile,
 )
 from disco_hw.log.drive import DriveLog, rows
 from disco_hw.log.importing.csv_drive import write_csv
 from disco_hw.log.load import drive_from_log, nominal_robot
-from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, PROFILE, RECOVERY
+from disco_hw.log.mcap_log import CHUNK_BYTES, LIBRARY, RECOVERY
 from disco_hw.log.reader import LogSummary, open_log
 from disco_hw.log.records import Controller
 from drivers.types import SOURCE_TEXTS, Identity, SaidBy
@@ -74,12 +75,10 @@ def export_rosbag(path: Path, out: Path, as_json: bool) -> str:
     """Write commands, wheels and poses of a log as a bag of ROS 2; raises LogError, InputError without `rosbags`."""
     with open_log(path) as log:
         drive = drive_from_log(log)
-        times = (log.columns(topic).get("t_ns") for topic in ("/command", "/wheels", "/pose"))
-        first_ns = min(int(t_ns.min()) for t_ns in times if t_ns is not None and t_ns.size)
         robot = nominal_robot(log)
         radius_m, axial_m = robot.get("wheel_radius_m"), robot.get("axial_distance_m")
         geometry = None if radius_m is None or axial_m is None else (radius_m, axial_m)
-        messages = write_rosbag(drive, out, first_ns + log.metadata.wall_offset_ns, geometry)
+        messages = write_rosbag(drive, out, drive.began_ns + log.metadata.wall_offset_ns, geometry)
     return _exported(out, "messages", messages, drive, as_json)
 
 
@@ -119,6 +118,10 @@ def _describe_end(summary: LogSummary) -> str:
     )
 
 
+# Chosen: above the drift of a clock in hours.
+_CLOCK_CHANGE_S = 1.0
+
+
 def _describe(summary: LogSummary) -> str:
     size_mb = summary.bytes / 1e6
     count = summary.segment_breaks
@@ -129,6 +132,13 @@ def _describe(summary: LogSummary) -> str:
         f"{summary.ticks} ticks, {summary.missing_ticks} missing{breaks}; {_describe_end(summary)}",
     ]
     lines += [f"continues {summary.continues}"] if summary.continues else []
+    ahead_s = summary.wall_clock_change_s
+    if abs(ahead_s) >= _CLOCK_CHANGE_S:
+        ahead = "ahead of" if ahead_s > 0.0 else "behind"
+        lines.append(
+            f"at its end the wall clock was {abs(ahead_s):.1f} s {ahead} the wall-clock times of the log: the computer "
+            "was suspended, or its clock was set"
+        )
     lines += [
         f"  {topic:<24} {item.count:>9}  {item.rate_hz:8.1f} Hz" for topic, item in sorted(summary.topics.items())
     ]
@@ -178,13 +188,13 @@ def recover_log(source: Path, target: Path) -> Recovered:
 
 def _copy(fd: int, contents: Contents, writer: Writer, name: str) -> Recovered:
     all_damage = list(contents.damage)
-    writer.start(profile=PROFILE, library=LIBRARY)
+    writer.start(profile=read_profile(fd), library=LIBRARY)
     for metadata in contents.metadata:
         writer.add_metadata(metadata.name, metadata.metadata)
     attachments = 0
     for ref in contents.attachments:
         try:
-            writer.add_attachment(ref.log_time, ref.log_time, ref.name, ref.media_type, read_attachment(fd, ref))
+            writer.add_attachment(ref.create_time, ref.log_time, ref.name, ref.media_type, read_attachment(fd, ref))
             attachments += 1
         except DamagedError as damage:
             all_damage.append(str(damage))

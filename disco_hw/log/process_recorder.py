@@ -199,7 +199,7 @@ class ProcessRecorder:
         """End the log and wait at most `timeout_s` for it; a writer still busy then finishes by itself."""
         if self._final is None:
             deadline_s = time.monotonic() + timeout_s
-            self._end = msgspec.msgpack.encode(End(time.monotonic_ns(), self._sequence, self._delivery.dropped_ticks))
+            self._end = self._last_word(self._sequence)
             # There may be room again.
             self._retry_s = 0.0
             while self._is_busy and time.monotonic() < deadline_s:
@@ -267,9 +267,8 @@ class ProcessRecorder:
         if line is None or not line.send_rest() or self._part_ends:
             return
         if self._is_part_full(line.status):
-            end = End(time.monotonic_ns(), delivery.last_sent, delivery.dropped_ticks, continued=True)
             self._part_ends = True
-            line.send_end(msgspec.msgpack.encode(end))
+            line.send_end(self._last_word(delivery.last_sent, continued=True))
             return
         for _ in range(most):
             following = delivery.next_frame()
@@ -280,6 +279,10 @@ class ProcessRecorder:
                 return
         if self._end is not None and delivery.next_frame() is None:
             line.send_end(self._end)
+
+    def _last_word(self, sequence: int, *, continued: bool = False) -> bytes:
+        dropped = self._delivery.dropped_ticks
+        return msgspec.msgpack.encode(End(time.monotonic_ns(), sequence, dropped, continued, wall_offset_ns()))
 
     def _is_part_full(self, status: WriterStatus) -> bool:
         """Whether the part is to be ended; not without a keeper, which starts the next writer."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import math
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -14,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from disco_hw.errors import LogError
+from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG, open_file
 from disco_hw.log import End
 from disco_hw.log.container import (
@@ -120,7 +122,8 @@ class LogSummary(msgspec.Struct, frozen=True):
     `missing_ticks` were given to the recorder and are not in the file: between its ticks, before the first as far as
     the former part says, and after the last where the log was ended. `segment_breaks`: of an import, how often a new
     segment begins. `ended`: the recorder ended it, at `end`; None for
-    a log from before that was recorded. `continued`: as the file was full, and the log goes on in another part.
+    a log from before that was recorded. `wall_clock_change_s`: time by which the wall clock was ahead of the log's
+    wall-clock times then. `continued`: as the file was full, and the log goes on in another part.
     `complete`: its index is there. `continues`: the former part. `damage`: what of the file is lost.
     """
 
@@ -129,6 +132,7 @@ class LogSummary(msgspec.Struct, frozen=True):
     complete: bool
     ended: bool | None
     end: str
+    wall_clock_change_s: float
     continued: bool
     continues: str
     robot: str
@@ -283,6 +287,9 @@ class Log:
         # A part that continues another holds ticks from before it was begun.
         start_ns = min(self.metadata.start_ns, first) if ticks else self.metadata.start_ns
         ending = self.ending
+        offset_ns = end_offset_ns = self.metadata.wall_offset_ns
+        if ending is not None and ending.wall_offset_ns is not None:
+            end_offset_ns = ending.wall_offset_ns
         if ending is not None:
             missing += max(0, ending.sequence - (self._last_tick or self.metadata.continues_sequence or 0))
         return LogSummary(
@@ -290,13 +297,14 @@ class Log:
             bytes=self._contents.size,
             complete=self.complete,
             ended=True if ending is not None else False if self.metadata.format >= FORMAT else None,
-            end=_iso((last if ending is None else ending.t_ns) + self.metadata.wall_offset_ns),
+            end=_iso((last if ending is None else ending.t_ns) + end_offset_ns),
+            wall_clock_change_s=(end_offset_ns - offset_ns) * 1e-9,
             continued=ending is not None and ending.continued,
             continues=self.metadata.continues,
             robot=self.metadata.robot,
             version=self.metadata.version,
             part=self.metadata.part,
-            start=_iso(start_ns + self.metadata.wall_offset_ns),
+            start=_iso(start_ns + offset_ns),
             duration_s=duration_s,
             ticks=ticks,
             missing_ticks=missing,
@@ -353,6 +361,24 @@ class Log:
 def open_log(path: Path) -> Log:
     """Open a log of ours; raises LogError, with one line for the user, if it is none."""
     return Log(path)
+
+
+@contextlib.contextmanager
+def open_parts(path: Path) -> Iterator[list[Log]]:
+    """Open a log and the parts beside it that go on with it, in their order; raises LogError as `open_log`.
+
+    All parts of a run have its offset of the clocks, to the nanosecond. A part that cannot be opened is left out.
+    """
+    with contextlib.ExitStack() as stack:
+        first = stack.enter_context(open_log(path))
+        parts = []
+        for other in path.parent.glob(f"{glob.escape(path.stem)}.part*{glob.escape(path.suffix)}"):
+            with contextlib.suppress(LogError, InputError):
+                part = stack.enter_context(open_log(other))
+                is_later = part.metadata.part > max(first.metadata.part, 1)
+                if is_later and part.metadata.wall_offset_ns == first.metadata.wall_offset_ns:
+                    parts.append(part)
+        yield [first, *sorted(parts, key=lambda part: part.metadata.part)]
 
 
 def _contents(fd: int, path: Path) -> Contents:

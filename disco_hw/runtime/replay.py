@@ -18,8 +18,9 @@ from disco_hw.control.plan import DISTURBANCE_UNTIL_VERSION, PLANNER_VERSION, SA
 from disco_hw.errors import InputError
 from disco_hw.fence.clearance import Boundaries
 from disco_hw.log.mcap_log import Metadata
-from disco_hw.log.reader import Entry, open_log
+from disco_hw.log.reader import Entry, Log, open_parts
 from disco_hw.log.records import (
+    STATES,
     BeliefChange,
     Command,
     Controller,
@@ -77,7 +78,11 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class ReplayReport:
-    """Result of a replay: how many ticks and values were compared, and where they first differ (None if nowhere)."""
+    """Result of a replay: how many ticks and values were compared, and where they first differ (None if nowhere).
+
+    `parts`: names of the files that were replayed. `next_part_missing`: the last of them goes on in one that is not
+    beside it.
+    """
 
     ticks: int
     values: int
@@ -85,6 +90,8 @@ class ReplayReport:
     recorded_by: str
     difference: Difference | None
     tolerance: float
+    parts: tuple[str, ...] = ()
+    next_part_missing: bool = False
 
     @property
     def ok(self) -> bool:
@@ -98,6 +105,10 @@ class ReplayReport:
     def as_text(self) -> str:
         """Return the report as text."""
         lines = [f"{self.ticks} ticks, {self.values} values compared; recorded by disco-hw {self.recorded_by}"]
+        if len(self.parts) > 1:
+            lines.append(f"{len(self.parts)} parts: {', '.join(self.parts)}")
+        if self.next_part_missing:
+            lines.append(f"{self.parts[-1]} goes on in another part, which is not beside it and was not replayed")
         if self.missing_ticks:
             lines.append(f"{self.missing_ticks} ticks are missing from the log: from there on nothing can be equal")
         if self.difference is None:
@@ -111,7 +122,7 @@ class ReplayReport:
 
 
 def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
-    """Replay a log with the robot.toml and the model that it carries.
+    """Replay a log, with all its parts, with the robot.toml and the model that it carries.
 
     `tolerance`: what numbers may differ by, in their own units or as a share of the larger, whichever allows more; 0
     for bit for bit, which only the machine that recorded promises: another processor rounds sums differently. The plans
@@ -119,7 +130,8 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
     Raises LogError for a log that cannot be read and InputError for one that holds no ticks or no robot.toml, that
     continues another, or that has plans of a planner version that is not known here.
     """
-    with open_log(path) as log:
+    with open_parts(path) as parts:
+        log = parts[0]
         if log.metadata.continues_sequence:
             raise InputError(
                 f"{path}: continues {log.metadata.continues}, and a replay needs a run from its first tick on; give "
@@ -130,19 +142,21 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
             raise InputError(
                 f"{path}: its commands are from {first.source!r}, not from a planner or a hand; {_REPLAYED}"
             )
-        has_plans = next(iter(log.records(("/plan",))), None) is not None
+        has_plans = any(True for part in parts for _ in part.records(("/plan",)))
         setup = _planned_as_recorded(setup_of_log(log, _REPLAYED), path, log.metadata, has_plans)
         # What was driven by hand needs no planner, whose compilation would take longer than the replay.
         planned = any(
             isinstance(entry.record, Command) and entry.record.source in _PLANNED
-            for entry in log.records(("/command",))
+            for part in parts
+            for entry in part.records(("/command",))
         )
         planner = create_planner(setup.config, setup.model) if planned else NoPlanner()
         pipeline = create_pipeline(setup.config, setup.model, planner)
         area = _ReplayedArea(pipeline, setup.config)
         ticks = values = 0
         difference: Difference | None = None
-        for tick, entries in groupby(log.records(_TOPICS), key=lambda entry: entry.tick):
+        used: list[Log] = []
+        for tick, entries in groupby(_entries(parts, used), key=lambda entry: entry.tick):
             recorded = list(entries)
             for task in (entry.record for entry in recorded if isinstance(entry.record, Task)):
                 changed = task_of(task, setup.config.task)
@@ -160,7 +174,39 @@ def replay(path: Path, tolerance: float = 0.0) -> ReplayReport:
         if not ticks:
             damage = f" that can be read: {log.damage[0]}" if log.damage else ""
             raise InputError(f"{path}: holds no ticks{damage}; give the log of a `disco-hw run`")
-        return ReplayReport(ticks, values, log.summary().missing_ticks, log.metadata.version, difference, tolerance)
+        ending = used[-1].ending
+        return ReplayReport(
+            ticks,
+            values,
+            sum(part.summary().missing_ticks for part in used),
+            log.metadata.version,
+            difference,
+            tolerance,
+            tuple(part.path.name for part in used),
+            difference is None and ending is not None and ending.continued,
+        )
+
+
+def _entries(parts: Sequence[Log], used: list[Log]) -> Iterator[Entry]:
+    """Yield the records of the parts of a log as those of one run, as far as no part is missing; fill in `used`.
+
+    A part begins with the states in force, which the part before holds already, and with ticks that were not confirmed.
+    """
+    last_tick = 0
+    states: dict[type, int] = {}
+    for part in parts:
+        if used and (part.metadata.continues_sequence or 0) > last_tick:
+            return
+        used.append(part)
+        done, known = last_tick, dict(states)
+        for entry in part.records(_TOPICS):
+            kind, t_ns = type(entry.record), entry.record.t_ns
+            if entry.tick <= done or (kind in known and t_ns <= known[kind]):
+                continue
+            last_tick = entry.tick
+            if kind in STATES:
+                states[kind] = t_ns
+            yield entry
 
 
 def _planned_as_recorded(setup: Setup, path: Path, recorded: Metadata, has_plans: bool) -> Setup:

@@ -66,7 +66,7 @@ def test_deviations_of_robot_toml_are_metres_and_radians_whatever_the_units_of_t
     found = settings.convention().converted(pose)
     assert (found.position_std_m, found.yaw_std_rad) == pytest.approx((0.03, 0.04))
     inlet = TransformInlet(settings, "base_link")
-    (message,) = inlet.poses(transform("map", "base_link", WALL_NS, 1.0), 0, WALL_NS, static=False)
+    (message,) = inlet.poses(transform("map", "base_link", WALL_NS, 1.0), 0, MONO_NS, WALL_NS, static=False)
     assert message.pose.covariance[0] == pytest.approx(30.0**2)
     assert message.pose.covariance[35] == pytest.approx(math.degrees(0.04) ** 2)
 
@@ -132,7 +132,8 @@ class TestTransforms:
     def poses_of(self, inlet, at_ms, parent, child, place, static=False, now_ms=None):
         """The poses that a transform at a time brings."""
         now_ns = WALL_NS + (at_ms if now_ms is None else now_ms) * MS
-        return list(inlet.poses(transform(parent, child, WALL_NS + at_ms * MS, *place), now_ns, now_ns, static=static))
+        message = transform(parent, child, WALL_NS + at_ms * MS, *place)
+        return list(inlet.poses(message, now_ns, now_ns - WALL_NS + MONO_NS, now_ns, static=static))
 
     @staticmethod
     def place(pose):
@@ -202,7 +203,7 @@ class TestTransforms:
         def poses_by(at_ms, x, publisher):
             now_ns = WALL_NS + at_ms * MS
             message = transform("map", "odom", now_ns, x)
-            return list(inlet.poses(message, 0, now_ns, static=False, publisher=publisher))
+            return list(inlet.poses(message, 0, MONO_NS + at_ms * MS, now_ns, static=False, publisher=publisher))
 
         for at_ms in range(0, 500, 50):
             self.poses_of(inlet, at_ms, "odom", "base_link", (1.0, 0.0, 0.0))
@@ -217,6 +218,20 @@ class TestTransforms:
         self.poses_of(inlet, 60_000, "map", "odom", (1.0, 0.0, 0.0))
         self.poses_of(inlet, 0, "odom", "base_footprint", (1.0, 0.0, 0.0))
         assert self.poses_of(inlet, 0, "map", "odom", (3.0, 0.0, 0.0))
+
+    @pytest.mark.parametrize(("step_ms", "set_back_ms"), [(2000, 1000), (2960, 3_600_000)])
+    def test_after_the_clock_was_set_back_poses_come_at_once_and_a_second_publisher_takes_over(
+        self, inlet, step_ms, set_back_ms
+    ):
+        def passes(at_ms, publisher):
+            mono_ns, now_ns = MONO_NS + at_ms * MS, WALL_NS + (at_ms - (at_ms > step_ms) * set_back_ms) * MS
+            list(inlet.poses(transform("odom", "base_link", now_ns, at_ms), 0, mono_ns, now_ns, static=False))
+            message = transform("map", "odom", now_ns, at_ms)
+            return len(list(inlet.poses(message, 0, mono_ns, now_ns, static=False, publisher=publisher)))
+
+        assert all(passes(at_ms, "slam") for at_ms in range(0, 3000, 50))
+        assert [passes(3000 + at_ms, "restarted") for at_ms in (0, 1000, 1900, 1950)] == [0, 0, 0, 1]
+        assert "poses now come from restarted; slam has sent nothing for 2.0 s" in inlet.new_messages()[0]
 
     @pytest.mark.parametrize("correction_first", [True, False])
     def test_a_robot_that_stands_still_has_poses_again_after_a_clock_was_set_back(self, inlet, correction_first):

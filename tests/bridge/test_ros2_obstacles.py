@@ -10,10 +10,11 @@ import pytest
 
 pytest.importorskip("cyclonedds", reason="cyclonedds is not installed: make venv")
 
+from disco_hw.bridge import ros2
 from disco_hw.bridge import ros2_messages as msg
 from disco_hw.bridge.ros2 import Bridge
 from disco_hw.bridge.ros2_obstacles import TOPIC, ObstacleInlet
-from disco_hw.runtime.obstacles import MOST_OBSTACLES, obstacle_source_of, reports_in
+from disco_hw.runtime.obstacles import MOST_OBSTACLES, ObstacleReport, Obstacles, obstacle_source_of, reports_in
 from disco_hw.runtime.robot_setup import load_setup
 from tests.drivers.waiting import free_port
 from tests.first_use.miswired import robot_file
@@ -36,7 +37,7 @@ def array(*obstacles, frame="map", age_ns=20 * MS):
 
 
 def received(message, inlet=None, sent_ns=WALL_NS):
-    datagrams = (inlet or ObstacleInlet("map")).datagrams(message, sent_ns, WALL_NS)
+    datagrams = (inlet or ObstacleInlet("map")).datagrams(message, sent_ns, 0, WALL_NS)
     return [one for datagram in datagrams for one in reports_in(datagram)]
 
 
@@ -121,8 +122,8 @@ def test_obstacles_with_equal_ids_are_all_kept_and_those_of_the_array_before_rem
     assert inlet.passed == 8
     late_ns = WALL_NS + 3_000_000_000
     later = msg.ObstacleArrayMsg(msg.Header(msg.stamp_of(late_ns), "map"), [])
-    assert len(inlet.datagrams(later, late_ns, late_ns)) == 5
-    assert inlet.datagrams(later, late_ns, late_ns) == []
+    assert len(inlet.datagrams(later, late_ns, late_ns - WALL_NS, late_ns)) == 5
+    assert inlet.datagrams(later, late_ns, late_ns - WALL_NS, late_ns) == []
 
 
 def test_a_track_that_is_missing_from_an_array_is_not_removed():
@@ -146,23 +147,48 @@ def test_an_array_that_is_refused_or_another_publishers_removes_none(partial):
     received(array(*[obstacle(number=0)] * 3), inlet)
     assert names(partial, inlet)[1] == []
     whole = array(obstacle(number=0))
-    assert inlet.datagrams(whole, WALL_NS, WALL_NS, publisher="another")[1:] == []
+    assert inlet.datagrams(whole, WALL_NS, 0, WALL_NS, publisher="another")[1:] == []
 
 
-def later_array(count, after_s, inlet, publisher):
+def later_array(count, after_s, inlet, publisher, set_back_s=0):
     """Return the names of those removed by an array of `count` numbered obstacles that comes so much later."""
-    at_ns = WALL_NS + round(after_s * 1e9)
+    mono_ns = round(after_s * 1e9)
+    at_ns = WALL_NS + mono_ns - set_back_s * 1_000_000_000
     message = msg.ObstacleArrayMsg(msg.Header(msg.stamp_of(at_ns), "map"), [obstacle(number=0)] * count)
-    found = [one for datagram in inlet.datagrams(message, at_ns, at_ns, publisher) for one in reports_in(datagram)]
+    datagrams = inlet.datagrams(message, at_ns, mono_ns, at_ns, publisher)
+    found = [one for datagram in datagrams for one in reports_in(datagram)]
     return [one.name for one in found if one.removed]
 
 
-def test_a_sender_that_restarts_takes_over_the_numbered_obstacles_of_before():
+@pytest.mark.parametrize("set_back_s", [0, 3600])
+def test_a_sender_that_restarts_takes_over_the_numbered_obstacles_of_before(set_back_s):
+    """Also where the clock of the computer was set back meanwhile."""
     inlet = ObstacleInlet("map")
     later_array(4, 0.0, inlet, "first")
-    assert later_array(2, 0.5, inlet, "restarted") == []
+    assert later_array(2, 0.5, inlet, "restarted", set_back_s) == []
     # A removal is repeated, as a datagram can be lost.
-    assert [later_array(2, at_s, inlet, "restarted") for at_s in (1.5, 3.0)] == 2 * [["ros2.0.3", "ros2.0.4"]]
+    removed = [later_array(2, at_s, inlet, "restarted", set_back_s) for at_s in (1.5, 3.0)]
+    assert removed == 2 * [["ros2.0.3", "ros2.0.4"]]
+
+
+def test_a_bridge_that_restarts_takes_over_the_numbered_obstacles_that_the_daemon_has(tmp_path, monkeypatch):
+    known = Obstacles()
+    for name in ("ros2.0", "ros2.0.2", "ros2.0.3", "ros2.-1", "ros2.9", "ros2.9.2", "ros2.7", "cart", "ros2.x"):
+        known.report(0, ObstacleReport(name=name, x_m=0.0, y_m=0.0, radius_m=1.0))
+    status = {"area": {"obstacles": known.status(1_500 * MS)}}
+    monkeypatch.setattr(ros2, "send_request", lambda _, __: status)
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 0)
+    # Without a domain of DDS, which takes a second to join.
+    bridge = Bridge.__new__(Bridge)
+    bridge._config = load_setup(robot_file(tmp_path)).config
+    bridge._obstacles = ObstacleInlet("map")
+    bridge._take_over_obstacles()
+    # A track, and what another program reports, is not the bridge's to remove.
+    removed = later_array(1, 0.1, bridge._obstacles, "sender")
+    assert set(removed) == {"ros2.0.2", "ros2.0.3", "ros2.-1", "ros2.9", "ros2.9.2"}
+    # A daemon that does not answer has none.
+    status.clear()
+    bridge._take_over_obstacles()
 
 
 def test_a_sender_that_is_silent_loses_nothing_to_one_that_was_there_beside_it():

@@ -131,7 +131,9 @@ def test_after_a_suspend_of_this_computer_the_robot_does_not_drive_on(tmp_path, 
     driven = Driven(tmp_path, name, coasting_s=0.2)
     driven.drive()
     driven.suspend(3.0)
-    driven.daemon._suspend_watch = SimpleNamespace(was_suspended=[*(50 * [False]), True].pop)
+    driven.daemon._suspend_watch = SimpleNamespace(suspended_s=[*(50 * [0.0]), 3.0].pop)
+    said = []
+    driven.daemon._report = lambda *text: said.append(text)
     fastest_rad_s = driven.rig.speed_rad_s
     for _ in range(50):
         driven.daemon._tick(driven.now_ns())
@@ -139,6 +141,9 @@ def test_after_a_suspend_of_this_computer_the_robot_does_not_drive_on(tmp_path, 
         fastest_rad_s = max(fastest_rad_s, driven.rig.speed_rad_s)
     assert fastest_rad_s < 0.1
     assert driven.core.state not in IN_USE
+    (text,) = [text for kind, text in said if kind == "link"]
+    assert "was suspended for 3 s" in text
+    assert "wall-clock times in the log are that much too early" in text
 
 
 def test_of_a_fence_into_which_the_task_does_not_fit_that_is_said(tmp_path):

@@ -3,6 +3,7 @@ import os
 import struct
 import tracemalloc
 from contextlib import contextmanager
+from itertools import product
 
 import pytest
 import zstandard
@@ -137,6 +138,29 @@ def test_a_wrong_checksum_is_noticed_where_everything_else_fits():
 @pytest.mark.parametrize("length", [0, 5, 2**40, 2**64 - 1])
 def test_a_chunk_whose_length_is_wrong_costs_itself_only(length):
     assert sequences(overwritten(KILLED, CHUNKS[4].offset - 8, struct.pack("<Q", length))) == ALL_BUT_THE_FIFTH
+
+
+def records_of(data):
+    """Offset and length of each record of a file whose end is missing."""
+    at, found = len(MAGIC), []
+    while at < len(data):
+        length = 9 + struct.unpack_from("<Q", data, at + 1)[0]
+        found.append((at, length))
+        at += length
+    return found
+
+
+def test_a_flipped_bit_in_the_head_of_a_record_costs_one_chunk_at_most_and_is_named():
+    killed = log_bytes(drive_ticks(40), flush_every=5, finish=False)
+    whole = contents_of(killed)
+    # What stands before the first chunk, and the first two chunks with the index of their messages.
+    around = {length: at for at, length in records_of(killed) if at < whole.chunks[2].offset - 9}
+    parts = ("chunks", "attachments", "metadata")
+    for at, place, bit in product(around.values(), range(9), (0, 1, 3, 4, 6)):
+        contents = contents_of(flipped(killed, at + place, 1 << bit))
+        assert len(contents.chunks) >= len(whole.chunks) - 1, (at, place, bit)
+        is_less = any(len(getattr(contents, part)) < len(getattr(whole, part)) for part in parts)
+        assert not is_less or len(contents.damage) > len(whole.damage), (at, place, bit)
 
 
 def test_a_hole_of_zeros_costs_what_it_covers_only():

@@ -1,6 +1,7 @@
 import io
 import json
 import os
+from datetime import datetime
 
 import pytest
 from mcap.reader import make_reader
@@ -11,13 +12,24 @@ from disco_hw.errors import InputError, LogError
 from disco_hw.files import LOG
 from disco_hw.log import Attachment, End
 from disco_hw.log.container import MAGIC
+from disco_hw.log.importing.rosbag_file import is_bag
 from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export, info, recover, recover_log
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Controller
 from tests.log.processes import files_of_at_most
 from tests.tables import thinned
-from tools.log_samples import ATTACHMENTS, PERIOD_NS, bits, drive_ticks, log_bytes, tick, with_damaged_chunk, write_log
+from tools.log_samples import (
+    ATTACHMENTS,
+    PERIOD_NS,
+    WALL_OFFSET_NS,
+    bits,
+    drive_ticks,
+    log_bytes,
+    tick,
+    with_damaged_chunk,
+    write_log,
+)
 
 
 @pytest.fixture
@@ -68,6 +80,43 @@ def test_an_index_alone_does_not_prove_that_the_log_was_ended(tmp_path):
 def test_what_was_given_and_never_delivered_is_missing_at_the_end(tmp_path):
     short = write_log(tmp_path / "short.mcap", drive_ticks(100), end=End(101 * PERIOD_NS, 793, 286))
     assert "100 ticks, 693 missing; ended properly" in info(short, as_json=False)
+
+
+def test_a_recovered_file_of_another_writer_keeps_its_profile_and_the_times_of_what_is_attached(tmp_path):
+    """Without the profile a bag of ROS 2 would be none any more."""
+    source, target = tmp_path / "bag.mcap", tmp_path / "new.mcap"
+    with source.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        writer.add_attachment(5, 9, "calibration.yaml", "text/yaml", b"x: 1")
+        writer.add_message(writer.register_channel("/a", "cdr", 0), 7, b"x", 7)
+        writer.finish()
+    recover_log(source, target)
+    assert is_bag(target.read_bytes()[:64])
+    with target.open("rb") as stream:
+        (kept,) = make_reader(stream).iter_attachments()
+    assert (kept.create_time, kept.log_time) == (5, 9)
+    # Of a file whose header is damaged nothing says what it was.
+    data = bytearray(source.read_bytes())
+    data[len(MAGIC) + 9] = 0xFF
+    source.write_bytes(data)
+    assert recover_log(source, tmp_path / "no_profile.mcap").messages == 1
+
+
+@pytest.mark.parametrize(
+    ("step_s", "said"), [(3600.0, "3600.0 s ahead of"), (-2.5, "2.5 s behind"), (0.9, ""), (None, "")]
+)
+def test_info_says_that_the_wall_clock_went_on_otherwise_than_the_log(tmp_path, step_s, said):
+    offset_ns = None if step_s is None else WALL_OFFSET_NS + round(step_s * 1e9)
+    end = End(101 * PERIOD_NS, 100, 0, wall_offset_ns=offset_ns)
+    path = write_log(tmp_path / "run.mcap", drive_ticks(100), end=end)
+    text = info(path, as_json=False)
+    assert (f"at its end the wall clock was {said}" in text) == bool(said)
+    assert ("wall clock" in text) == bool(said)
+    ended = json.loads(info(path, as_json=True))["end"]
+    assert datetime.fromisoformat(ended).timestamp() == pytest.approx(
+        (101 * PERIOD_NS + (offset_ns or WALL_OFFSET_NS)) * 1e-9, abs=2e-3
+    )
 
 
 def test_a_later_part_says_what_it_continues_and_what_is_missing_in_between(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from disco_hw.errors import LogError
-from disco_hw.log import Attachment
+from disco_hw.log import Attachment, End
 from disco_hw.log.load import drive_from_log, nominal_robot
 from disco_hw.log.reader import open_log
 from disco_hw.log.records import Command, Event
@@ -51,6 +51,14 @@ def test_missing_ticks_start_a_new_segment_in_every_array(tmp_path):
     assert np.count_nonzero(drive.commands.segment) == 51
     assert 50 <= np.count_nonzero(drive.wheels.segment) <= 51
     assert np.count_nonzero(drive.poses.segment) in (10, 11)
+
+
+def test_a_drive_whose_log_goes_on_in_another_part_says_so(tmp_path):
+    end = End(100 * PERIOD_NS, 100, 0, continued=True)
+    drive = drive_of(tmp_path, drive_ticks(100), end=end)
+    assert drive.notes == (
+        f"{tmp_path / 'run.mcap'}: was full, and goes on in the next part, which is a log of its own",
+    )
 
 
 def test_silent_wheels_start_a_new_segment(tmp_path):

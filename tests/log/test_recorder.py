@@ -42,6 +42,7 @@ def test_what_is_put_is_in_the_log(path):
         assert log.metadata.version == "9.9.9"
         assert log.attachment_names() == tuple(kept.name for kept in ATTACHMENTS)
         assert abs(log.metadata.wall_offset_ns - wall_offset_ns()) < 10**9
+        assert abs(log.ending.wall_offset_ns - wall_offset_ns()) < 10**9
     expected = [(t_ns, k, record) for k, t_ns in enumerate(times, start=1) for record in tick(k, t_ns)]
     assert bits([(entry.now_ns, entry.tick, entry.record) for entry in entries]) == bits(expected)
     assert (summary.ticks, summary.missing_ticks) == (200, 0)

@@ -82,15 +82,20 @@ def write_ticks(
     planner: int = PLANNER_VERSION,
     part: int = 1,
     continues_sequence: int | None = None,
+    states: Sequence[Record] = (),
+    wall_offset_ns: int = 10**18,
+    *,
+    continued: bool = False,
 ) -> Path:
     """Write what a recorder was given as a log, in this process: starting another takes longer than a short log."""
     encode, number, now_ns = batch_encoder(), 0, 0
     with path.open("xb") as file:
-        begin = Start(str(path), "wombot", "", 0, 10**18, part, "run.mcap" * (part > 1), continues_sequence)
+        begin = Start(str(path), "wombot", "", 0, wall_offset_ns, part, "run.mcap" * (part > 1), continues_sequence)
         log = McapLog(file, structs.replace(begin, attachments=tuple(files), planner=planner))
-        for number, (now_ns, records) in enumerate(ticks, start=1):
+        log.begin_with(encode(0, 0, states))
+        for number, (now_ns, records) in enumerate(ticks, start=1 + (continues_sequence or 0)):
             log.write(encode(number, now_ns, records))
-        log.end(End(now_ns, number, 0))
+        log.end(End(now_ns, number, 0, continued))
         log.finish()
     assert log.refused == 0
     return path

@@ -15,7 +15,7 @@ from disco_hw.control.plan import DISTURBANCE_UNTIL_VERSION, PLANNER_VERSION
 from disco_hw.errors import InputError
 from disco_hw.log import MODEL_TOML, ROBOT_TOML, Attachment
 from disco_hw.log.reader import open_log
-from disco_hw.log.records import Command, Plan
+from disco_hw.log.records import STATES, Command, Plan
 from disco_hw.model import EffectSetting, load_model, save_model
 from disco_hw.runtime.pipeline import Source
 from disco_hw.runtime.replay import replay
@@ -40,16 +40,14 @@ def write_log(
     ticks,
     robot: str | None = None,
     model: str | None = None,
-    planner: int = PLANNER_VERSION,
-    part: int = 1,
-    continues_sequence: int | None = None,
+    **how,
 ) -> Path:
     texts = {
         ROBOT_TOML: robot or (ROBOTS / "wombot.toml").read_text(),
         MODEL_TOML: model or (ROBOTS / "wombot_model.toml").read_text(),
     }
     attachments = [Attachment(name, "application/toml", text.encode()) for name, text in texts.items()]
-    return write_ticks(path, ticks, attachments, planner, part, continues_sequence)
+    return write_ticks(path, ticks, attachments, **how)
 
 
 def test_the_same_robot_gives_the_same_bits(tmp_path, ticks):
@@ -177,6 +175,32 @@ def test_a_part_that_continues_another_is_refused_and_one_that_has_all_ticks_is_
         replay(log)
     # The first writer failed before it had a tick.
     assert replay(write_log(tmp_path / "all.mcap", ticks[:20], part=2, continues_sequence=0)).ok
+
+
+def states_in_force(ticks):
+    return tuple({type(one): one for _, records in ticks for one in records if type(one) in STATES}.values())
+
+
+def test_all_parts_of_a_log_are_replayed_as_one_run(tmp_path, ticks):
+    """A part begins with the states in force, which do not begin anew, and may repeat ticks that were not confirmed."""
+    whole = replayed(write_log(tmp_path / "whole.mcap", ticks))
+    write_log(tmp_path / "run.part2.mcap", ticks[100:150], part=2, continues_sequence=100)
+    states = states_in_force(ticks[:145])
+    write_log(tmp_path / "run.part4.mcap", ticks[145:], part=4, continues_sequence=145, states=states)
+    # Of another run, and one that holds nothing.
+    write_log(tmp_path / "run.part3.mcap", ticks[:20], part=3, continues_sequence=100, wall_offset_ns=5)
+    (tmp_path / "run.part5.mcap").write_bytes(b"")
+    report = replayed(write_log(tmp_path / "run.mcap", ticks[:110], continued=True))
+    assert (report.ticks, report.values, report.missing_ticks) == (whole.ticks, whole.values, 0)
+    assert report.parts == ("run.mcap", "run.part2.mcap", "run.part4.mcap")
+    assert "3 parts" in report.as_text()
+
+
+def test_a_replay_says_that_a_part_is_not_there(tmp_path, ticks):
+    write_log(tmp_path / "run.part3.mcap", ticks[30:40], part=3, continues_sequence=30)
+    report = replayed(write_log(tmp_path / "run.mcap", ticks[:20], continued=True))
+    assert report.ticks == 20
+    assert "run.mcap goes on in another part, which is not beside it and was not replayed" in report.as_text()
 
 
 def test_plans_that_were_refined_otherwise_are_refused_and_a_log_without_plans_is_replayed(tmp_path, ticks):

@@ -73,12 +73,14 @@ def format_of(begin: bytes) -> LogFormat | None:
 SOURCE = "import"
 _LONGEST_S = 9e9
 """Nanoseconds of more do not fit into the 64 bits that a log has for them."""
+# Year 2096, as for stamps of a bag: later ones are no dates.
+_LATEST_BEGIN_NS = 4 * 10**18
 
 _Timed = tuple[int, int, Record]
 
 
 def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attachment, ...] = ()) -> int:
-    """Write a new log and return how many records it has; its time 0 is the drive's.
+    """Write a new log and return how many records it has; its time 0 is the drive's, and so is its date if known.
 
     A change of segment leaves out one tick's number. Raises LogError if the file exists or cannot be
     written.
@@ -94,8 +96,9 @@ def write_log(drive: DriveLog, path: Path, robot: str, attachments: tuple[Attach
         raise LogError(f"{path}: cannot be created ({error.strerror}); give another place") from None
     try:
         angle, speed = drive.wheels.angle_measured, drive.wheels.speed_measured
+        offset_ns = drive.began_ns if 0 < drive.began_ns < _LATEST_BEGIN_NS else 0
         start = Start(
-            str(path), robot, version(), 0, 0, part=0, attachments=attachments,
+            str(path), robot, version(), 0, offset_ns, part=0, attachments=attachments,
             angle_measured=angle, speed_measured=speed,
         )  # fmt: skip
         log = McapLog(file, start)

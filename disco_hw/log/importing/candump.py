@@ -11,7 +11,7 @@ import re
 from array import array
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -50,12 +50,16 @@ _LARGEST_DISORDER_NS = 100_000_000
 
 @dataclass(frozen=True, slots=True)
 class Dump:
-    """A candump that was read once: `t_ns` (N,) of its frames since the first, and how many each channel has."""
+    """A candump that was read once: `t_ns` (N,) of its frames since the first, and how many each channel has.
+
+    `began_ns`: the time stamp of the first.
+    """
 
     path: Path
     t_ns: Index
     channels: dict[str, int]
     notes: tuple[str, ...]
+    began_ns: int
 
     def frames(self, channel: str) -> Iterator[ReceivedFrame]:
         """Yield the data frames with a standard identifier that came on this channel."""
@@ -108,7 +112,8 @@ def read_dump(path: Path) -> Dump:
         notes.append(loss_note(str(path), "lines", bad, filled, what, hint))
     if not channels:
         raise LogError(f"{path}: holds no frame; record with `candump -L`")
-    return Dump(path, _increasing(path, np.array(t_ns, dtype=np.int64), notes), dict(channels), tuple(notes))
+    since_ns = _increasing(path, np.array(t_ns, dtype=np.int64), notes)
+    return Dump(path, since_ns, dict(channels), tuple(notes), t_ns[0])
 
 
 def _increasing(path: Path, stamps_ns: Index, notes: list[str]) -> Index:
@@ -220,7 +225,8 @@ def read_candump(path: Path, config: RobotConfig, channel: str = "") -> DriveLog
             )
         )  # fmt: skip
     commands, wheels, poses = _samples(_expired(rows.commands), 3), _samples(rows.wheels, 5), _samples(rows.poses, 4)
-    return drive_of(str(path), commands, wheels, poses, notes=warnings_first(tuple(notes)))
+    drive = drive_of(str(path), commands, wheels, poses, notes=warnings_first(tuple(notes)))
+    return replace(drive, began_ns=dump.began_ns + drive.began_ns)
 
 
 def _decoded(dump: Dump, channel: str, config: RobotConfig) -> _Rows:

@@ -47,7 +47,7 @@ from disco_hw.log.importing.csv_sheet import (
     Sheet,
     read_sheet,
 )
-from disco_hw.log.importing.losses import share_note, warnings_first
+from disco_hw.log.importing.losses import share_note, unknown_commands_note, warnings_first
 
 # Chosen: a median from sample to sample outside these is milliseconds or nanoseconds read as seconds.
 _LONGEST_PERIOD_S = 1.0
@@ -165,7 +165,7 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
     refuse(time_fault(sheet.t_s[max(samples.values(), key=np.count_nonzero)], longest_s))
     sheet, wheels = _wheels(sheet, ticks_per_rev, notes)
     t_s, segment = sheet.t_s, sheet.segment
-    commands = _commands(sheet, notes)
+    commands = _commands(sheet, wheels, notes)
     position, there = sheet.group(POSITION)
     x_m, y_m = position[there].T
     yaw_rad = sheet.group((YAW,))[0][there, 0]
@@ -179,10 +179,11 @@ def read_csv(path: Path, ticks_per_rev: float | None = None, wheel_radius_m: flo
     gyro = Gyro(t_s[turning], rate[turning, 0], segment[turning])
     if not (np.isfinite(commands.left_rad_s).any() or wheels.t_s.size or poses.t_s.size):
         raise LogError(f"{path}: no row has a command, an encoder sample or a pose; nothing was driven in it")
-    return DriveLog((str(path),), commands, wheels, poses, gyro, warnings_first((*sheet.notes, *notes)))
+    notes_first = warnings_first((*sheet.notes, *notes))
+    return DriveLog((str(path),), commands, wheels, poses, gyro, notes_first, began_ns=round(sheet.begin_s * 1e9))
 
 
-def _commands(sheet: Sheet, notes: list[str]) -> Commands:
+def _commands(sheet: Sheet, wheels: Wheels, notes: list[str]) -> Commands:
     """Commands, with a row of NaN where from then on none is known.
 
     A file with a command in most rows writes what is in force: over half a second of empty cells says that nothing is.
@@ -195,7 +196,8 @@ def _commands(sheet: Sheet, notes: list[str]) -> Commands:
     next_s = np.append(t_s[rows], np.inf)[1:]
     ends = np.append(~given[1:], False)[rows]
     expires = ends & (next_s - t_s[rows] > LONGEST_COMMAND_S)
-    if 2 * np.count_nonzero(ends) > rows.size:
+    on_change = 2 * np.count_nonzero(ends) > rows.size
+    if on_change:
         end_s = t_s[rows[expires]] + LONGEST_COMMAND_S
         unknown_s = float(np.maximum(np.minimum(next_s[expires], t_s[-1]) - end_s, 0.0).sum())
         of_s = float(t_s[-1] - t_s[rows[0]])
@@ -210,7 +212,11 @@ def _commands(sheet: Sheet, notes: list[str]) -> Commands:
     unknown_from_s = np.concatenate([t_s[:1][~given[:1]], end_s[end_s <= t_s[-1]]])
     times_s, speeds = with_unknown(t_s[rows], values[rows], unknown_from_s)
     segment = sheet.segment[np.searchsorted(t_s, times_s, side="right") - 1]
-    return Commands(times_s, speeds[:, 0], speeds[:, 1], segment)
+    commands = Commands(times_s, speeds[:, 0], speeds[:, 1], segment)
+    if not on_change:
+        why = f"as its cells are empty for over {LONGEST_COMMAND_S:g} s; write one that is in force into every row"
+        notes += unknown_commands_note(sheet.name, t_s, commands, wheels, why)
+    return commands
 
 
 def _wheels(sheet: Sheet, ticks_per_rev: float | None, notes: list[str]) -> tuple[Sheet, Wheels]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.errors import LogError
-from disco_hw.log.drive import DriveLog, Poses, Wheels, chosen
+from disco_hw.log.drive import LONGEST_COMMAND_S, Array, Commands, DriveLog, Poses, Wheels, chosen
 
 WARNING = "warning: "
 """Notes that begin with this are printed before everything else."""
@@ -35,6 +35,34 @@ def loss_note(source: str, signal: str, dropped: int, total: int, what: str, hin
 def share_note(text: str, share: float) -> str:
     """Return the sentence with the share of a signal that it speaks of; it begins with WARNING above 5 %."""
     return f"{WARNING if share > WARNED_SHARE else ''}{text} ({_percent(share)})"
+
+
+# Chosen: above what the noise of an encoder makes of a wheel that stands.
+_TURNING_RAD_S = 0.1
+
+
+def unknown_commands_note(source: str, t_s: Array, commands: Commands, wheels: Wheels, why: str) -> tuple[str, ...]:
+    """Return the sentence on the time for which no command is known, if there is any; `t_s`: the times of the log.
+
+    Where the wheels were measured, only the time in which they turn counts.
+    """
+    if not np.isfinite(commands.left_rad_s).any():
+        return ()
+    counted = np.diff(t_s)
+    text = ""
+    if wheels.t_s.size:
+        t_s, text = wheels.t_s, " in which the wheels turn"
+        turning = np.maximum(np.abs(wheels.left_speed_rad_s), np.abs(wheels.right_speed_rad_s)) > _TURNING_RAD_S
+        counted = np.minimum(np.diff(t_s), LONGEST_COMMAND_S) * (turning[:-1] & (np.diff(wheels.segment) == 0))
+    known = np.append(np.isfinite(commands.left_rad_s), False)[np.searchsorted(commands.t_s, t_s[:-1], "right") - 1]
+    unknown_s, of_s = float(counted[~known].sum()), float(counted.sum())
+    if not unknown_s:
+        return ()
+    return (
+        share_note(
+            f"{source}: commands: none is known for {unknown_s:.1f} of {of_s:.1f} s{text}, {why}", unknown_s / of_s
+        ),
+    )
 
 
 def warnings_first(notes: tuple[str, ...]) -> tuple[str, ...]:

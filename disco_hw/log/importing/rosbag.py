@@ -31,7 +31,7 @@ from disco_hw.log.drive import (
 from disco_hw.log.importing import LogFormat
 from disco_hw.log.importing.counter_wrap import WIDTHS_BITS, continuous_wheels, restarts
 from disco_hw.log.importing.csv_drive import length_fault
-from disco_hw.log.importing.losses import WARNING, loss_note
+from disco_hw.log.importing.losses import WARNING, loss_note, unknown_commands_note
 from disco_hw.log.importing.rosbag_file import Bag, DamagedBagError, Undecoded, is_bag, message_of, open_bag
 from disco_hw.log.importing.rosbag_times import Column, alike, timeline
 from disco_hw.log.importing.rosbag_topics import (
@@ -108,8 +108,8 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
             columns[role] = Column(width)
             takes.setdefault(used.topic, []).append((role, read_row))
     by_tf = choice.used(POSES) is not None and POSES not in columns
-    edges = {edge: Column(7) for edge in choice.edges} if by_tf else {}
-    static: set[Edge] = set()
+    # An edge that moves may have been latched, too, before it did.
+    edges = {edge: (Column(7), Column(7)) for edge in choice.edges} if by_tf else {}
     transforms = {one.name for one in bag.topics.values() if one.type in TRANSFORMS} if by_tf else set()
     for number, message in enumerate(bag.messages({*takes, *transforms}, undecoded=undecoded)):
         if number >= _MOST_MESSAGES:
@@ -126,12 +126,11 @@ def _columns(bag: Bag, choice: Choice, config: RobotConfig, undecoded: dict[str,
             for one in message.value.transforms:
                 edge = (one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/"))
                 if edge in edges:
-                    edges[edge].add(
+                    edges[edge][message.topic.endswith("static")].add(
                         message.log_ns, stamp_of(one), finite(_place(one.transform.translation, one.transform.rotation))
                     )
-                    if message.topic.endswith("static"):
-                        static.add(edge)
-    return columns | {_edge_name(edge, edge in static): column for edge, column in edges.items()}
+    is_static = {edge: not moving.log_ns for edge, (moving, _) in edges.items()}
+    return columns | {_edge_name(edge, is_static[edge]): both[is_static[edge]] for edge, both in edges.items()}
 
 
 def _edge_name(edge: Edge, static: bool) -> str:
@@ -175,6 +174,9 @@ def _assembled(path: Path, choice: Choice, columns: dict[str, Column], robot: Ro
             f"{breaks_ns.size} times the wheels paused, or a clock or encoder was set; new segments begin there"
         )
     drive = drive_of(str(path), (command_ns, command), (wheel_ns, wheel), (pose_ns, pose), breaks_ns, measured)
+    times_s = np.unique(np.concatenate([drive.commands.t_s, drive.wheels.t_s, drive.poses.t_s]))
+    why = f"as each counts for {LONGEST_COMMAND_S:g} s at most"
+    notes += unknown_commands_note(str(path), times_s, drive.commands, drive.wheels, why)
     fault = length_fault(drive.poses, drive.wheels, drive.commands, robot.wheel_radius_m)
     if fault is not None:
         notes.append(f"poses and wheels do not fit together: {fault.rpartition(';')[0]}; see which topics were read")

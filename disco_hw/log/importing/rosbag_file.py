@@ -182,20 +182,21 @@ def _readers(path: Path, stack: ExitStack, notes: list[str], salvage: bool) -> t
     inside = sorted(
         (one for one in path.iterdir() if one.suffix in SUFFIXES.values()), key=lambda one: _natural(one.name)
     )
-    fault = f"it has no {METADATA}"
+    fault, prefix = f"it has no {METADATA}", ""
     if (path / METADATA).exists() and not salvage:
         try:
             return [_opened(path, False, stack, notes, salvage=False)], False
         except DamagedBagError as error:
             if not inside:
                 raise
-            fault = str(error).partition(": ")[2].partition(";")[0]
+            # A file that it names may be missing.
+            fault, prefix = str(error).partition(": ")[2].partition(";")[0], WARNING
     if not inside:
         raise LogError(f"{path}: a folder without {METADATA} and without a bag; give the folder or file of a bag")
     kinds = {_check_file(one) for one in inside}
     if len(kinds) > 1:
         raise LogError(f"{path}: holds bags of ROS 1 and ROS 2; give one of its files")
-    notes.append(f"{path}: read by its files ({', '.join(one.name for one in inside)}), as {fault}")
+    notes.append(f"{prefix}{path}: read by its files ({', '.join(one.name for one in inside)}), as {fault}")
     readers = [_opened(one, kinds == {True}, stack, notes, salvage) for one in inside]
     return sorted(readers, key=lambda reader: int(reader.start_time)), kinds == {True}
 

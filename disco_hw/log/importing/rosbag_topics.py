@@ -93,7 +93,7 @@ def choose(bag: Bag, settings: Ros2) -> Choice:
     candidates: list[TopicCandidate] = []
     configured = {COMMANDS: settings.command_topic, WHEELS: settings.wheel_topic, POSES: settings.pose_topic}
     for role in ROLES:
-        found = [*_of_role(bag, role, left, right, settings), *(_by_tf(bag, route) if role == POSES else ())]
+        found = [*_of_role(bag, role, left, right, settings), *(_by_tf(bag, route, edges) if role == POSES else ())]
         candidates += _one_used(bag, role, found, configured[role])
     if not any(one.used for one in candidates):
         why = {one.topic: f", {one.why}" for one in candidates if one.rank >= _UNREADABLE_RANK}
@@ -220,14 +220,17 @@ def _as_pose(bag: Bag, topic: BagTopic, left: tuple[str, ...], right: tuple[str,
     return rank, why
 
 
-def _by_tf(bag: Bag, route: tuple[Edge, ...] | None) -> Iterable[TopicCandidate]:
+def _by_tf(bag: Bag, route: tuple[Edge, ...] | None, edges: Sequence[Edge]) -> Iterable[TopicCandidate]:
     if route is None:
         return
     frames = " - ".join([route[0][0], *(child for _, child in route)])
     count = sum(topic.count for topic in bag.topics.values() if topic.type in TRANSFORMS)
-    yield TopicCandidate(
-        POSES, TF, "tf2_msgs/msg/TFMessage", count, 25, f"{frames}, where its first moving part changes"
-    )
+    why = f"{frames}, where its first moving part changes"
+    for used in route:
+        others = [parent for parent, child in edges if child == used[1] and parent != used[0]]
+        if others:
+            why += f"; {used[1]} has another parent too, which is left out: {', '.join(others[:3])}"
+    yield TopicCandidate(POSES, TF, "tf2_msgs/msg/TFMessage", count, 25, why)
 
 
 def _first(bag: Bag, topic: str) -> Iterator[BagMessage]:
@@ -260,11 +263,11 @@ def _is_wheel(name: str) -> bool:
     return "wheel" in name.lower() and _NO_WHEEL.search(name.lower()) is None
 
 
-def _edges(bag: Bag) -> set[Edge]:
-    """Edges of the transforms at the bag's beginning and from its middle on."""
+def _edges(bag: Bag) -> tuple[Edge, ...]:
+    """Edges of the transforms at the bag's beginning and from its middle on, in the order in which they came."""
     topics = [topic.name for topic in bag.topics.values() if topic.type in TRANSFORMS]
     static = [name for name in topics if name.endswith("static")]
-    found: set[Edge] = set()
+    found: dict[Edge, None] = {}
     middle_ns = bag.start_ns + (bag.end_ns - bag.start_ns) // 2
     for names, start_ns, most in (
         (static, None, math.inf),
@@ -274,8 +277,9 @@ def _edges(bag: Bag) -> set[Edge]:
         for at, message in enumerate(bag.messages(names, start_ns)):
             if at >= most:
                 break
-            found |= {(_frame(one.header.frame_id), _frame(one.child_frame_id)) for one in message.value.transforms}
-    return found
+            edges = ((_frame(one.header.frame_id), _frame(one.child_frame_id)) for one in message.value.transforms)
+            found |= dict.fromkeys(edges)
+    return tuple(found)
 
 
 def _frame(name: str) -> str:
@@ -283,7 +287,7 @@ def _frame(name: str) -> str:
     return name.lstrip("/")
 
 
-def _route(bag: Bag, edges: set[Edge], settings: Ros2) -> tuple[Edge, ...] | None:
+def _route(bag: Bag, edges: Sequence[Edge], settings: Ros2) -> tuple[Edge, ...] | None:
     maps = [settings.map_frame] if settings.map_frame else list(MAP_FRAMES)
     bases = [settings.base_frame] if settings.base_frame else list(BASE_FRAMES)
     for map_frame in maps:

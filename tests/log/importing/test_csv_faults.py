@@ -267,6 +267,21 @@ def test_commands_that_are_written_on_change_count_for_half_a_second(tmp_path):
     assert "write the one in force into every row" in only_note(drive)
 
 
+def test_a_joysticks_ramp_that_is_written_on_change_does_not_lose_the_command_without_a_word(tmp_path):
+    """Few commands, each other than the one before, and the last of each ramp held for 2 s."""
+    header = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_rad_s,enc_right_rad_s"
+    speeds = [min(k % 100, 10) + k // 100 for k in range(400)]
+    cells = [f"{v},{v}" if v != before else "," for v, before in zip(speeds, [None, *speeds], strict=False)]
+    lines = [f"{0.02 * k:.2f},{cell},{v},{v}" for k, (v, cell) in enumerate(zip(speeds, cells, strict=True))]
+    drive = read(tmp_path, "\n".join([header, *lines]))
+    (note,) = drive.notes
+    assert note.startswith("warning: ")
+    assert "commands: none is known for 7.1 of 8.0 s in which the wheels turn" in note
+    # A robot that stands while nothing is commanded has lost nothing.
+    lines = [f"{0.02 * k:.2f},{'2,2,2,2' if k < 100 else ',,0,0'}" for k in range(400)]
+    assert read(tmp_path, "\n".join([header, *lines])).notes == ()
+
+
 def test_commands_on_change_are_known_throughout_if_they_change_often(tmp_path):
     drive = read(tmp_path, with_commands(10))
     assert drive.commands.t_s.tolist() == pytest.approx(np.arange(10) * 0.5)

@@ -40,6 +40,23 @@ def test_a_candump_is_distinguished_from_a_csv_file_by_its_content(robot, tmp_pa
     assert load_drive(found.out).poses.t_s.size > 190
 
 
+def test_the_date_of_a_csv_file_and_of_a_candump_is_kept(robot, tmp_path):
+    """A clock that counts from another time has no date, and a time beyond those of a log none that can be kept."""
+
+    def start_of(path):
+        with open_log(import_log(path, robot, path.with_suffix(".mcap")).out) as log:
+            return log.summary().start[:16]
+
+    def sheet(name, begin_s):
+        rows = [f"{begin_s + 0.02 * k:.2f},1,1,2,2" for k in range(100)]
+        header = "t_s,cmd_left_rad_s,cmd_right_rad_s,enc_left_rad_s,enc_right_rad_s"
+        (tmp_path / name).write_text("\n".join([header, *rows]))
+        return tmp_path / name
+
+    assert start_of(sheet("a.csv", 1.7e9)) == start_of(dumped(tmp_path / "b.log")) == "2023-11-14T22:13"
+    assert start_of(sheet("c.csv", 5.0)) == start_of(sheet("d.csv", 1e12)) == "1970-01-01T00:00"
+
+
 def test_our_own_logs_need_no_import(imported, robot, tmp_path):
     with pytest.raises(LogError, match="an MCAP log; a log of disco-hw needs no import"):
         import_log(imported, robot, tmp_path / "again.mcap")

@@ -142,6 +142,44 @@ def test_a_clock_that_is_set_is_said_and_taken_out(path, by_s):
     assert drive.poses.t_s[-1] == pytest.approx(drive.wheels.t_s[-1], abs=0.2)
 
 
+def test_commands_that_run_out_while_the_wheels_turn_are_named(path):
+    """A joystick publishes on change: a command counts for half a second, and what holds it longer is not known."""
+
+    def write(maker, k):
+        maker.wheels(k)
+        if k % 100 < 10:
+            maker.write("/cmd_vel", maker.twist(0.1 * (k % 100), 0.0), time_ns(k))
+
+    drive = read_bag(path, 400, write)
+    assert has_note(drive, "commands: none is known for 5.3 of 8.0 s in which the wheels turn")
+    assert any(note.startswith("warning: ") and "5.3 of 8.0 s" in note for note in drive.notes)
+
+
+def test_a_transform_that_moves_is_none_that_stands_still_for_one_that_was_latched(path):
+    def write(maker, k):
+        if k == 0:
+            maker.write("/tf_static", maker.transforms(time_ns(k), ("map", "odom", 7.0, 0.0, 0.0, 0.0)), time_ns(k))
+        edges = [("map", "odom", 0.01 * k, 0.0, 0.0, 0.0), ("odom", "base_link", 0.02 * k, 0.0, 0.0, 0.0)]
+        maker.write("/tf", maker.transforms(time_ns(k), *edges), time_ns(k))
+
+    np.testing.assert_allclose(read_bag(path, 50, write).poses.x_m, 0.03 * np.arange(50), atol=1e-9)
+
+
+def test_of_two_parents_of_a_frame_the_first_counts_and_the_other_is_named(tmp_path):
+    for number in range(6):
+        first, second = f"odom{number}", f"vision{number}"
+
+        def write(maker, k, first=first, second=second):
+            for name, y_m in ((first, 0.01 * k), (second, 5.0 + 0.01 * k)):
+                edges = [("map", name, 0.0, y_m, 0.0, 0.0), (name, "base_link", 0.0, 0.0, 0.0, 0.0)]
+                maker.write("/tf", maker.transforms(time_ns(k), *edges), time_ns(k))
+
+        drive = read_bag(tmp_path / first, 20, write)
+        assert drive.poses.y_m[-1] == pytest.approx(0.19)
+        assert f"map - {first} - base_link" in drive.notes[0]
+        assert f"base_link has another parent too, which is left out: {second}" in drive.notes[0]
+
+
 def test_a_simulated_clock_is_said_and_unstamped_commands_are_carried_over(path):
     """A simulation at half the speed of time, whose clock began at 100 s."""
     start_s = 100.0 - BEGAN_NS * 1e-9

@@ -1,5 +1,6 @@
 """A log of ours as a bag of ROS 2, read by the stock readers and imported again."""
 
+import math
 from dataclasses import replace
 from itertools import islice
 
@@ -9,6 +10,7 @@ import pytest
 pytest.importorskip("rosbags", reason="pip install 'disco-hw[ros2]'")
 
 from mcap.reader import make_reader
+from msgspec import structs
 from rosbags.highlevel import AnyReader
 
 from disco_hw.errors import LogError
@@ -17,9 +19,13 @@ from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export_rosbag, write_rosbag
+from disco_hw.log.reader import open_log
+from drivers.types import PoseSample
 from tests.inference.drives import logged, robot_config, write_log
 from tests.inference.test_infer_command import ROBOT
+from tests.log.importing.bags import BEGAN_NS
 from tests.log.importing.commands import call
+from tests.runtime.simulated import write_ticks
 
 
 @pytest.fixture(scope="module")
@@ -39,6 +45,33 @@ def test_what_is_exported_is_imported_again(log, tmp_path):
     given = np.isfinite(back.commands.left_rad_s)
     known = np.isfinite(drive.commands.left_rad_s)
     np.testing.assert_array_equal(back.commands.left_rad_s[given], drive.commands.left_rad_s[known])
+
+
+def test_the_date_of_a_bag_is_kept_over_an_import_and_an_export(tmp_path):
+    """Also where the first record of the log is one that is left out."""
+    (tmp_path / "robot.toml").write_text(ROBOT)
+    write_rosbag(logged("poor"), tmp_path / "bag", BEGAN_NS, None)
+    imported = import_log(tmp_path / "bag", tmp_path / "robot.toml", tmp_path / "log.mcap").out
+    with open_log(imported) as log:
+        assert log.summary().start.startswith("2023-11-14T22:13:20")
+        ticks = [(entry.now_ns + 10**9, [entry.record]) for entry in log.records()]
+    times_ns = [stamps_of(export) for export in (tmp_path / "bag", exported(imported, tmp_path / "again"))]
+    np.testing.assert_array_equal(*times_ns)
+    bare = PoseSample(0, 0, 0.0, 0.0, math.nan, 0.01, math.nan)
+    later = [(t_ns, [structs.replace(one, t_ns=one.t_ns + 10**9)]) for t_ns, (one,) in ticks]
+    path = write_ticks(tmp_path / "later.mcap", [(0, [bare]), *later], wall_offset_ns=BEGAN_NS - 10**9)
+    np.testing.assert_array_equal(stamps_of(exported(path, tmp_path / "later")), times_ns[0])
+
+
+def exported(log, bag):
+    export_rosbag(log, bag, as_json=False)
+    return bag
+
+
+def stamps_of(bag):
+    """Return the times of the wheels in a bag, as the stock reader has them."""
+    with AnyReader([bag]) as reader:
+        return [t_ns for one, t_ns, _ in reader.messages() if one.topic == "/joint_states"]
 
 
 def test_angles_that_were_derived_from_speeds_are_not_exported(tmp_path):

@@ -296,6 +296,17 @@ def test_a_folder_whose_metadata_is_missing_or_wrong_is_read_by_its_files(tmp_pa
     assert import_log(folder, robot, tmp_path / "log.mcap").duration_s == pytest.approx(0.98, abs=0.01)
 
 
+def test_a_file_of_the_metadata_that_is_not_there_is_a_warning(tmp_path):
+    folder = small(tmp_path / "b")
+    metadata = folder / "metadata.yaml"
+    file = file_of(folder).name
+    metadata.write_text(metadata.read_text().replace(f"- {file}\n", f"- {file}\n  - gone.mcap\n", 1))
+    drive = read_rosbag(folder, robot_config())
+    assert drive.wheels.t_s.size == 50
+    assert drive.notes[0].startswith("warning: ")
+    assert "gone.mcap" in drive.notes[0]
+
+
 def test_an_empty_storage_identifier_is_read_by_the_files(tmp_path):
     folder = small(tmp_path / "b")
     metadata = folder / "metadata.yaml"
@@ -316,6 +327,7 @@ def test_the_files_of_a_bag_that_was_split_are_read_in_order_of_time(tmp_path, s
     drive = read_rosbag(folder, robot_config())
     names = ", ".join(f"log_{number}.{ENDINGS[storage]}" for number in (8, 9, 10))
     assert f"read by its files ({names}), as it has no metadata.yaml" in drive.notes[0]
+    assert not drive.notes[0].startswith("warning: ")
     np.testing.assert_allclose(drive.wheels.left_angle_rad, 0.1 * np.arange(150))
     np.testing.assert_allclose(np.diff(drive.wheels.t_s), 0.02, atol=1e-9)
     assert drive.segments == 1
