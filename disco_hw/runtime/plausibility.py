@@ -229,6 +229,8 @@ class PoseJumps:
 
 # Chosen: a smaller loss of speed is within what a robot's speed varies by anyway.
 LIMITED_PART = 0.95
+# Chosen: a place that takes so much more of the task's speed is another to know of.
+MORE_LIMITED = 0.1
 FOLLOWS = (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
 """Sources of the command of a robot that follows its task."""
 
@@ -236,12 +238,15 @@ FOLLOWS = (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
 class PlannerEvents:
     """Says once when the planner begins and ceases to fail, to fall back, or to plan from too few samples.
 
-    A speed that the wheels limit is reported once in a drive. `fallback` names the law that drives without a plan.
+    A speed that the wheels limit is reported once in a drive, and again where they limit it clearly more. `fallback`
+    names the law that drives without a plan.
     """
 
     def __init__(self, fallback: str) -> None:
         self._fallback = fallback
-        self._failing = self._collapsed = self._fell_back = self._is_limited = False
+        self._failing = self._collapsed = self._fell_back = False
+        # Part of the task's speed: the last one that was reported in this drive, and that of the last plan.
+        self._reported_part = self._last_part = 1.0
 
     def step(self, source: Source, plan: WheelPlan | None, failure: str | None) -> tuple[str, ...]:
         """Return the events of a tick with this command's source, this new plan, or this failure to make one."""
@@ -251,7 +256,7 @@ class PlannerEvents:
             events.append(f"planner: {failure}" if failing else "planner: recovered")
         self._failing = failing
         if source not in FOLLOWS:
-            self._is_limited = False
+            self._reported_part = 1.0
         if plan is None:
             return tuple(events)
         found = plan.diagnostics
@@ -267,10 +272,17 @@ class PlannerEvents:
             few = f"planner: plans rest on {found.ess:.1f} effective samples, too few to trust the plan"
             events.append(few if found.collapsed else "planner: enough effective samples again")
         self._collapsed = found.collapsed
-        if found.speed_part < LIMITED_PART and not self._is_limited:
-            self._is_limited = True
+        if self._is_news(found.speed_part):
+            self._reported_part = found.speed_part
             events.append(
                 f"planner: the wheels limit the speed here, to {found.speed_part:.0%} of the task's; "
                 "the robot follows its line more slowly"
             )
+        self._last_part = found.speed_part
         return tuple(events)
+
+    def _is_news(self, part: float) -> bool:
+        """Whether the speed is limited for the first time, or clearly more. While the part falls, a corner is near."""
+        if self._reported_part == 1.0:
+            return part < LIMITED_PART
+        return self._last_part <= part < self._reported_part - MORE_LIMITED
