@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from disco_hw.config.robot import (
+    LONGEST_HORIZON,
     Control,
     DaemonSettings,
     Drive,
@@ -33,6 +34,7 @@ from disco_hw.files import LOG, MODEL_TOML, WAY_POINTS, open_file, read_toml
 
 __all__ = [
     "LINK_FORMS",
+    "LONGEST_HORIZON",
     "SHIPPED_ROBOT",
     "Control",
     "DaemonSettings",

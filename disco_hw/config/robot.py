@@ -160,6 +160,10 @@ class PoseInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return msgspec.structs.replace(self, position_std_m=position_std, yaw_std_rad=yaw_std)
 
 
+LONGEST_HORIZON = 500
+"""Steps of the longest plan: that robot.toml may ask for, and that slow tasks and a large x_icr lead to."""
+
+
 class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The loop and the planner."""
 
@@ -171,7 +175,7 @@ class Control(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     disturbance: bool = False
     fallback: Literal["ramp", "pure_pursuit", "kanayama", "lqr"] = "ramp"
     samples: Annotated[int, Meta(ge=8, le=1_000_000)] = 400
-    horizon: Annotated[int, Meta(ge=2, le=500)] | None = None
+    horizon: Annotated[int, Meta(ge=2, le=LONGEST_HORIZON)] | None = None
     step_s: Annotated[float, Meta(gt=0.0, le=1.0)] | None = None
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 1
     command_valid_for_s: Annotated[float, Meta(ge=0.02, le=0.1)] = 0.1

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import msgspec
 
-from disco_hw.config.robot import Link, PoseInput, Prior, Robot, RobotConfig
+from disco_hw.config.robot import LONGEST_HORIZON, Control, Link, PoseInput, Prior, Robot, RobotConfig
 from disco_hw.errors import FieldFault, InputError
 from disco_hw.fence import fence_fault
 from disco_hw.files import ROBOT_TOML, control_character_in, describe, field_of_others, read_toml
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 # Of all samples together. Chosen: some hundred times more than the planner rolls out, a tenth of a second and more.
-MOST_STEPS, USUAL_HORIZON = 20_000_000, 50
+MOST_STEPS = 20_000_000
 
 
 def load_robot_config(path: Path | str) -> RobotConfig:
@@ -233,22 +233,7 @@ def _check(path: Path, config: RobotConfig) -> None:
     fault = fence_fault(config.fence, config.robot.footprint)
     if fault is not None:
         _refuse(path, f"fence.{fault.field}", fault.fault, fault.hint)
-    control = config.control
-    if control.command_valid_for_s < 1.5 / control.rate_hz:
-        _refuse(
-            path,
-            "control.command_valid_for_s",
-            f"{control.command_valid_for_s} s is shorter than 1.5 control periods",
-            f"write at least {1.5 / control.rate_hz:.3f} or raise rate_hz",
-        )
-    steps = control.samples * (control.horizon or USUAL_HORIZON)
-    if steps > MOST_STEPS:
-        _refuse(
-            path, "control.samples", f"{steps} steps in all samples of the horizon, which take seconds to plan",
-            f"write at most {MOST_STEPS // (control.horizon or USUAL_HORIZON)}",
-        )  # fmt: skip
-    if control.telemetry_disarm_s <= control.telemetry_zero_s:
-        _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
+    _check_control(path, config.control)
     driver = find_driver(config.link.driver)
     # Every other medium carries CAN frames, as the one of that name does (docs/add-a-transport.md).
     medium = "serial" if config.link.kind == "serial" else "can"
@@ -263,6 +248,33 @@ def _check(path: Path, config: RobotConfig) -> None:
         _refuse(path, f"link.{field}", "belongs to a serial line, and to no other link", hint)
     if config.link.key_file is not None and not driver.authenticates:
         _refuse(path, "link.key_file", f"the driver {driver.name} has no authenticated mode", "remove it")
+
+
+def _check_control(path: Path, control: Control) -> None:
+    """Refuse plans that are too large or too short, and times that contradict each other."""
+    if control.command_valid_for_s < 1.5 / control.rate_hz:
+        _refuse(
+            path,
+            "control.command_valid_for_s",
+            f"{control.command_valid_for_s} s is shorter than 1.5 control periods",
+            f"write at least {1.5 / control.rate_hz:.3f} or raise rate_hz",
+        )
+    # Without a horizon the task's speed and the model's x_icr decide it, which may change; this is the most.
+    horizon = control.horizon or LONGEST_HORIZON
+    if control.samples * horizon > MOST_STEPS:
+        _refuse(
+            path, "control.samples",
+            f"{control.samples * horizon} steps in all samples of a horizon of {horizon}, which take long to plan",
+            f"write at most {MOST_STEPS // horizon}" + ("" if control.horizon else ", or set control.horizon"),
+        )  # fmt: skip
+    if control.step_s is not None and control.step_s < 1.0 / control.rate_hz:
+        _refuse(
+            path, "control.step_s",
+            f"{control.step_s:g} s is shorter than a control period, and the plan too short to drive by",
+            f"write at least {math.ceil(1e3 / control.rate_hz) / 1e3:g}, or remove it",
+        )  # fmt: skip
+    if control.telemetry_disarm_s <= control.telemetry_zero_s:
+        _refuse(path, "control.telemetry_disarm_s", "not above telemetry_zero_s", "write a larger value")
 
 
 def _check_pose(path: Path, pose: PoseInput, history_s: float) -> None:

@@ -47,8 +47,6 @@ FASTER_NOISE = 0.2
 # Measured with refined plans, x_icr of 0.8 to 2 m, circles of 2 to 6 m: below 1.5 robots stayed up to 0.3 m off, with
 # 2.5 some stood still, with 3.3 all but the largest were within 0.1 mm of the circle, with 4 all.
 LEAST_WAY_X_ICR, WAY_X_ICR = 3.3, 4.0
-# As many as `horizon` in robot.toml may be.
-LONGEST_HORIZON = 500
 USUAL_WIDE = 3.0
 
 Uncertainty = Literal["ut", "mc", "joint", "point"]
@@ -239,7 +237,7 @@ class DiscoSettings:
         if control.mode != "paper":
             behind_m = -x_icr_m if backwards else x_icr_m
             if horizon * step_s * speed_m_s < LEAST_WAY_X_ICR * behind_m:
-                horizon = min(math.ceil(WAY_X_ICR * behind_m / (speed_m_s * step_s)), LONGEST_HORIZON)
+                horizon = min(math.ceil(WAY_X_ICR * behind_m / (speed_m_s * step_s)), config.LONGEST_HORIZON)
         horizon = horizon if control.horizon is None else control.horizon
         sampler = replace(settings.sampler, samples=control.samples, horizon=horizon)
         return replace(settings, sampler=sampler, step_s=step_s, uncertainty=control.uncertainty, backwards=backwards)

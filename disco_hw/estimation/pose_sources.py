@@ -53,6 +53,8 @@ class TrackedSource:
     standing: Standing = Standing.WAITING
     came_ns: int | None = None
     good_ns: int | None = None
+    period_ns: int = 0
+    """Between the newest two accepted poses."""
     latency_s: float = math.nan
     position_std_m: float = math.nan
     yaw_std_rad: float = math.nan
@@ -144,6 +146,7 @@ class PoseSources:
             source.reported.add(update.reason)
             self._messages.append(refusal)
         if update.accepted:
+            source.period_ns = 0 if source.good_ns is None else sample.t_ns - source.good_ns
             source.good_ns = max(sample.t_ns, source.good_ns or sample.t_ns)
 
     def step(self, now_ns: int) -> None:
@@ -165,12 +168,24 @@ class PoseSources:
         return messages
 
     def refusal(self, now_ns: int) -> str:
-        """Why the newest pose of a source was refused, in words; empty if none was, or for no reason that lasts.
+        """Why the newest pose of a source was refused, or too old before the next came, in words; empty if neither.
 
-        A source that is silent is left out: that is then why there is no pose.
+        A refusal that does not last is left out, and so is a source that is silent: that is then why there is no pose.
         """
         came = (one for one in self.all if one.came_ns is not None and now_ns - one.came_ns <= self._timeout_ns)
-        return next((one.refusal for one in came if one.refusal), "")
+        refused = next((one.refusal for one in came if one.refusal), "")
+        return refused or next((text for one in self.all if (text := self._describe_period(one, now_ns))), "")
+
+    def _describe_period(self, source: TrackedSource, now_ns: int) -> str:
+        """Say that a source's poses come too rarely to be used throughout; empty if they do not, or no longer come."""
+        period_ns = source.period_ns
+        is_enough = not period_ns or not period_ns + 1e9 * source.latency_s > self._timeout_ns
+        if is_enough or source.came_ns is None or now_ns - source.came_ns > 2 * period_ns:
+            return ""
+        return (
+            f"{source.label}: poses come {period_ns * 1e-9:.2g} s apart and {source.latency_s:.2g} s late, with "
+            f"estimation.pose_timeout_s = {self._timeout_ns * 1e-9:g}; raise that, or send poses more often"
+        )
 
     def is_good(self, number: int) -> bool:
         """Whether poses of this source are believed; of a single one they always are."""

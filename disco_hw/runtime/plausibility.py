@@ -103,18 +103,44 @@ COMMANDED_RAD_S = 0.05
 """A command below this asks for no motion."""
 ROLLED_RAD = 0.5
 """Wheels that have turned less in the window stand."""
+FOLLOWED_PART = 0.5
+"""Unless they have turned by more than this part of what their commands came to."""
 
 
-@dataclass
+class _Span:
+    """How far a wheel is from where it began, and how far its extremes lie apart (rad)."""
+
+    def __init__(self) -> None:
+        self.now_rad = self._low_rad = self._high_rad = 0.0
+
+    def move_to(self, rad: float) -> None:
+        self.now_rad, self._low_rad, self._high_rad = rad, min(self._low_rad, rad), max(self._high_rad, rad)
+
+    @property
+    def size_rad(self) -> float:
+        return self._high_rad - self._low_rad
+
+
 class _Window:
-    """Since when and where the robot is; how far the wheels have turned and were asked to at most."""
+    """Since when and where the robot is; how far each wheel has turned there, and was commanded to."""
 
-    begun_ns: int
-    x_m: float
-    y_m: float
-    angles_rad: tuple[float, float] | None
-    largest_rad_s: float = 0.0
-    is_reported: bool = False
+    def __init__(self, now_ns: int, place_m: tuple[float, float], angles_rad: tuple[float, float] | None) -> None:
+        self.begun_ns, self.place_m, self.is_reported = now_ns, place_m, False
+        self.largest_rad_s = 0.0
+        self.turned, self.commanded = (_Span(), _Span()), (_Span(), _Span())
+        self.has_wheels = False
+        self._last_ns, self._first_rad = now_ns, angles_rad
+
+    def add(self, now_ns: int, command_rad_s: tuple[float, float], angles_rad: tuple[float, float] | None) -> None:
+        """Take in a tick, with the command that it ends with."""
+        self.largest_rad_s = max(self.largest_rad_s, *map(abs, command_rad_s))
+        since_s, self._last_ns = (now_ns - self._last_ns) * 1e-9, now_ns
+        for commanded, speed in zip(self.commanded, command_rad_s, strict=True):
+            commanded.move_to(commanded.now_rad + speed * since_s)
+        self.has_wheels = angles_rad is not None and self._first_rad is not None
+        if angles_rad is not None and self._first_rad is not None:
+            for turned, now_rad, first_rad in zip(self.turned, angles_rad, self._first_rad, strict=True):
+                turned.move_to(now_rad - first_rad)
 
 
 class Headway:
@@ -138,35 +164,42 @@ class Headway:
             return ()
         angles = None if wheels is None else (wheels.left_angle_rad, wheels.right_angle_rad)
         window = self._window
-        if window is None or math.hypot(place_m[0] - window.x_m, place_m[1] - window.y_m) > self._least_m:
-            self._window = _Window(now_ns, *place_m, angles)
+        if window is None or math.dist(place_m, window.place_m) > self._least_m:
+            self._window = _Window(now_ns, place_m, angles)
             return ("task: the robot makes progress again",) if window is not None and window.is_reported else ()
-        window.largest_rad_s = max(window.largest_rad_s, *map(abs, command_rad_s))
+        window.add(now_ns, command_rad_s, angles)
         if window.is_reported or now_ns - window.begun_ns < WINDOW_NS:
             return ()
         window.is_reported = True
-        return (f"task: no progress for 5 s: {_obstacle(window, angles, planner_failure)}",)
+        return (f"task: no progress for 5 s: {_obstacle(window, planner_failure)}",)
 
 
-def _obstacle(window: _Window, angles_rad: tuple[float, float] | None, planner_failure: str | None) -> str:
+def _obstacle(window: _Window, planner_failure: str | None) -> str:
     """Return the likely reason why the robot does not move, looked for from the commands down to the ground."""
     if planner_failure is not None:
         return f"the planner has no plan: {planner_failure}"
     if window.largest_rad_s < COMMANDED_RAD_S:
         return "the planner commands no motion; check the task and the position of the robot"
-    if angles_rad is None or window.angles_rad is None:
+    if not window.has_wheels:
         return (
             f"the wheels are commanded up to {window.largest_rad_s:.2f} rad/s, but no wheel data arrive; check the "
             "encoders"
         )
-    turned = max(abs(now - then) for now, then in zip(angles_rad, window.angles_rad, strict=True))
-    if turned < ROLLED_RAD:
+    turned_rad = max(span.size_rad for span in window.turned)
+    commanded_rad = max(span.size_rad for span in window.commanded)
+    ahead_rad = 0.5 * abs(sum(span.now_rad for span in window.turned))
+    if turned_rad < min(ROLLED_RAD, FOLLOWED_PART * commanded_rad):
         return (
             f"the wheels do not turn although commanded up to {window.largest_rad_s:.2f} rad/s: they are blocked, "
             "or have a dead band that the model lacks; free them, or find the dead band with `disco-hw gap`"
         )
+    if ahead_rad < ROLLED_RAD:
+        return (
+            f"the wheels follow their commands, up to {window.largest_rad_s:.2f} rad/s, but these turn the robot on "
+            "the spot or to and fro; check the task and the position of the robot"
+        )
     return (
-        f"the wheels have turned by {turned:.1f} rad, but the pose has not changed: check for slip, an obstacle or "
+        f"the wheels have turned by {turned_rad:.1f} rad, but the pose has not changed: check for slip, an obstacle or "
         "a frozen pose sensor"
     )
 
@@ -229,6 +262,8 @@ class PoseJumps:
 
 # Chosen: a smaller loss of speed is within what a robot's speed varies by anyway.
 LIMITED_PART = 0.95
+# Chosen: a place that takes so much more of the task's speed is another to know of.
+MORE_LIMITED = 0.1
 FOLLOWS = (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
 """Sources of the command of a robot that follows its task."""
 
@@ -236,12 +271,15 @@ FOLLOWS = (Source.PLAN, Source.TAIL, Source.FALLBACK, Source.RAMP)
 class PlannerEvents:
     """Says once when the planner begins and ceases to fail, to fall back, or to plan from too few samples.
 
-    A speed that the wheels limit is reported once in a drive. `fallback` names the law that drives without a plan.
+    A speed that the wheels limit is reported once in a drive, and again where they limit it clearly more. `fallback`
+    names the law that drives without a plan.
     """
 
     def __init__(self, fallback: str) -> None:
         self._fallback = fallback
-        self._failing = self._collapsed = self._fell_back = self._is_limited = False
+        self._failing = self._collapsed = self._fell_back = False
+        # Part of the task's speed: the last one that was reported in this drive, and that of the last plan.
+        self._reported_part = self._last_part = 1.0
 
     def step(self, source: Source, plan: WheelPlan | None, failure: str | None) -> tuple[str, ...]:
         """Return the events of a tick with this command's source, this new plan, or this failure to make one."""
@@ -251,7 +289,7 @@ class PlannerEvents:
             events.append(f"planner: {failure}" if failing else "planner: recovered")
         self._failing = failing
         if source not in FOLLOWS:
-            self._is_limited = False
+            self._reported_part = 1.0
         if plan is None:
             return tuple(events)
         found = plan.diagnostics
@@ -267,10 +305,17 @@ class PlannerEvents:
             few = f"planner: plans rest on {found.ess:.1f} effective samples, too few to trust the plan"
             events.append(few if found.collapsed else "planner: enough effective samples again")
         self._collapsed = found.collapsed
-        if found.speed_part < LIMITED_PART and not self._is_limited:
-            self._is_limited = True
+        if self._is_news(found.speed_part):
+            self._reported_part = found.speed_part
             events.append(
                 f"planner: the wheels limit the speed here, to {found.speed_part:.0%} of the task's; "
                 "the robot follows its line more slowly"
             )
+        self._last_part = found.speed_part
         return tuple(events)
+
+    def _is_news(self, part: float) -> bool:
+        """Whether the speed is limited for the first time, or clearly more. While the part falls, a corner is near."""
+        if self._reported_part == 1.0:
+            return part < LIMITED_PART
+        return self._last_part <= part < self._reported_part - MORE_LIMITED

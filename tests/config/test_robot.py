@@ -100,6 +100,8 @@ def test_a_mistake_gets_one_line_with_file_and_field(tmp_path, change, fragments
         ("[control]\nrate_hz = 20.0\ncommand_valid_for_s = 0.05\n", "control.command_valid_for_s"),
         ("[control]\ntelemetry_zero_s = 0.2\n", "control.telemetry_disarm_s"),
         ("[control]\nsamples = 1000000\nhorizon = 500\n", "control.samples: 500000000 steps"),
+        ("[control]\nsamples = 400000\n", "write at most 40000, or set control.horizon"),
+        ("[control]\nrate_hz = 30.0\nstep_s = 0.033\n", "control.step_s: 0.033 s is shorter than a control period"),
         ("[control]\nseed = 9223372036854775808\n", "control.seed"),
         ('[link]\nkind = "wifi"\n', "link.kind"),
         ('[task]\nkind = "square"\n', "task"),

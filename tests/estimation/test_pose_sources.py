@@ -275,6 +275,26 @@ def test_a_refusal_does_not_explain_why_later_poses_are_missing():
     assert fusion.sources.refusal(now_ns + 2 * 10**9) == ""
 
 
+def test_poses_further_apart_than_the_timeout_are_named_as_why_there_is_none():
+    fusion = PoseFusion(Estimation(), GEOMETRY, 0.15, ("gps",))
+    second_ns, come_ns = 10**9, []
+    for wheels in DRIVE.wheels[:300]:
+        fusion.add_wheels(wheels)
+        if not come_ns or wheels.t_ns - come_ns[-1] >= second_ns:
+            come_ns.append(wheels.t_ns)
+            assert fusion.sources.refusal(wheels.t_ns) == ""
+            fusion.add_pose(PoseSample(wheels.t_ns, wheels.t_ns, 1.0, 2.0, 0.3, 1.0, 1.0), wheels.t_ns + 20_000_000)
+        if len(come_ns) == 2:
+            break
+    assert fusion.sources.all[0].accepted == 2
+    text = (
+        "gps: poses come 1 s apart and 0.02 s late, with estimation.pose_timeout_s = 1; raise that, or send poses more "
+        "often"
+    )
+    assert fusion.sources.refusal(come_ns[-1] + second_ns) == text
+    assert fusion.sources.refusal(come_ns[-1] + 3 * second_ns) == ""
+
+
 def test_a_pose_from_before_the_first_wheel_sample_needs_no_remedy():
     fusion = PoseFusion(Estimation(), GEOMETRY, 0.15, ("natnet",))
     fusion.add_wheels(DRIVE.wheels[0])

@@ -47,6 +47,21 @@ def test_a_robot_that_stays_is_reported_once_with_what_stands_in_the_way(what, e
     assert expected in text
 
 
+@pytest.mark.parametrize("swings_rad_s", [(0.2, 0.2), (3.0, 3.0), (-2.0, 2.0)], ids=["hardly", "to and fro", "turning"])
+def test_wheels_that_follow_commands_which_lead_nowhere_are_not_called_blocked(swings_rad_s):
+    headway, found, angles = Headway(0.2), [], [0.0, 0.0]
+    for tick in range(300):
+        now_ns, sign = tick * TICK_NS, 1.0 if tick // 25 % 2 == 0 else -1.0
+        speeds = tuple(sign * speed for speed in swings_rad_s)
+        found += headway.step(now_ns, True, (0.0, 0.0), speeds, WheelSample(now_ns, now_ns, *angles, *speeds), None)
+        angles = [angle + 0.02 * speed for angle, speed in zip(angles, speeds, strict=True)]
+    ((_, _, reason),) = (text.split(": ", 2) for text in found)
+    assert reason == (
+        f"the wheels follow their commands, up to {max(swings_rad_s):.2f} rad/s, but these turn the robot on the "
+        "spot or to and fro; check the task and the position of the robot"
+    )
+
+
 @pytest.mark.parametrize("speed_m_s", [0.2, 0.02])
 def test_a_robot_that_drives_is_not_reported(speed_m_s):
     assert headway_events(60.0, speed_m_s=speed_m_s, robot_m_s=0.9 * speed_m_s) == []

@@ -1,4 +1,4 @@
-"""Events about the planner: each change is reported once, and a speed that the wheels limit once in a drive."""
+"""Events about the planner: each change is reported once, and a speed that the wheels limit where it is news."""
 
 from __future__ import annotations
 
@@ -27,6 +27,15 @@ def test_a_speed_that_the_wheels_limit_is_reported_once_in_a_drive() -> None:
     assert events.step(Source.PLAN, slow, None) == ("planner: recovered",)
     assert events.step(Source.HOLD, None, None) == ()
     assert events.step(Source.PLAN, slow, None) == (LIMITED,)
+
+
+def test_a_place_that_limits_the_speed_more_is_reported_when_its_part_no_longer_falls() -> None:
+    """A corner comes into the horizon over some ticks; another that limits the speed no more is not reported."""
+    events = PlannerEvents("ramp")
+    parts = (0.7, 0.6, 0.5, 0.4, 0.4, 0.4, 1.0, 0.35, 0.35, 1.0, 0.2, 0.25)
+    reported = [events.step(Source.PLAN, _plan(part), None) for part in parts]
+    worse = [(LIMITED.replace("70%", text),) for text in ("40%", "25%")]
+    assert reported == [(LIMITED,), (), (), (), worse[0], (), (), (), (), (), (), worse[1]]
 
 
 def test_a_speed_that_varies_a_little_is_not_reported() -> None:
