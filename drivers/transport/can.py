@@ -346,6 +346,26 @@ def lock_port(channel: str) -> int:
     return port
 
 
+def write_to_held_slcan(channel: str, frames: Sequence[Frame]) -> None:
+    """Write frames to an slcan adapter that another process holds, whose CAN channel stays as it is; else do nothing.
+
+    Raises OSError where the port is absent or takes nothing more.
+    """
+    port = os.open(channel.partition("@")[0], os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(port, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lines = [
+            f"{f'T{frame.can_id:08X}' if frame.extended else f't{frame.can_id:03X}'}"
+            f"{len(frame.data)}{frame.data.hex().upper()}"
+            for frame in frames
+        ]
+        # The first return ends what the other process may be in the middle of.
+        os.write(port, "\r".join(["", *lines, ""]).encode())
+    finally:
+        os.close(port)
+
+
 def require_server(host: str, port: int) -> None:
     """Raise OSError where nothing listens, LinkLostError where a server sends no greeting.
 

@@ -26,6 +26,8 @@ from tests.daemon.control_daemon import ControlDaemon
 SHIPPED = SHIPPED_ROBOT.read_text(encoding="utf-8")
 
 UART_NODE = 51
+_ESTOP_ID, _ESTOP_DATA = Codec().encode("ESTOP", reason=1)
+ESTOP_LINE = f"t{_ESTOP_ID:03X}{len(_ESTOP_DATA)}{_ESTOP_DATA.hex().upper()}".encode()
 STATE = {
     "state": "ESTOP", "fault": "NONE", "session": 0, "estop_source": "FRAME", "last_command_counter": 0,
     "rejected_count": 0, "reject_reason": "NONE", "stop_cause": "NONE",
@@ -239,16 +241,22 @@ def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_be
     assert (daemon.actions()[0], outcome.sent, outcome.confirmed) == ("estop", True, confirmed)
     if confirmed:
         assert "left to the daemon" in outcome.link_error
-        assert not select.select([robot_end], [], [], 0.0)[0], "nobody else opens the adapter"
+        assert set(os.read(robot_end, 4096).split(b"\r")) == {b"", ESTOP_LINE}, "nobody else opens the adapter"
     else:
         assert outcome.link_error is None
-        assert b"\rt080" in os.read(robot_end, 4096)
+        assert {b"O", ESTOP_LINE, b"C"} <= set(os.read(robot_end, 4096).split(b"\r"))
 
 
-@pytest.mark.parametrize("daemon_failed", [True, False])
-def test_the_stop_does_not_wait_for_a_daemon_that_has_just_failed_to_answer(tmp_path, line, monkeypatch, daemon_failed):
+@pytest.mark.parametrize(
+    ("daemon_failed", "is_held", "goes_at_once"), [(True, False, True), (False, False, False), (False, True, True)]
+)
+def test_the_stop_over_an_adapter_does_not_wait_for_a_daemon_that_has_just_failed_or_holds_it(
+    tmp_path, line, monkeypatch, daemon_failed, is_held, goes_at_once
+):
     robot_end, host_end = line
     tty.setraw(host_end)
+    if is_held:
+        fcntl.flock(host_end, fcntl.LOCK_EX)
     is_out = []
 
     def request(_):
@@ -260,7 +268,7 @@ def test_the_stop_does_not_wait_for_a_daemon_that_has_just_failed_to_answer(tmp_
     channel = {"/tmp/disco-hw-wombot.can": os.ttyname(host_end)}
     robot = robot_file(tmp_path, tmp_path / "none", link='interface = "slcan"', **channel)
     outcome = stop_robot(robot, daemon_failed=daemon_failed)
-    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [daemon_failed])
+    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [goes_at_once])
 
 
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])
