@@ -1,14 +1,15 @@
 """Stop the robot from outside, with as little as possible in the way.
 
-The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked as well; each
-way is tried whether or not the other worked. Only where the two would disturb each other is the daemon asked first, and
-the link is left to it if that stops the robot. A robot.toml whose other sections are broken still says where the link
-is; without one that can be read, the option --link does.
+The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked at the same
+time; each way is tried whether or not the other works. Only where the two would disturb each other is the daemon asked
+first, and the link is left to it if that stops the robot. A robot.toml whose other sections are broken still says where
+the link is; without one that can be read, the option --link does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -142,8 +143,10 @@ def stop_robot(
             return replace(outcome, link_error="left to the daemon, which holds the line", confirmed=daemon_confirmed)
         confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
     else:
+        request_stop = partial(_request_stop, socket_path)
+        await_daemon = request_stop if is_exchange else _begin(request_stop)
         confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
-        daemon_confirmed, daemon_error = _request_stop(socket_path)
+        daemon_confirmed, daemon_error = await_daemon()
     return replace(outcome, link_error=link_error, daemon_error=daemon_error, confirmed=confirmed or daemon_confirmed)
 
 
@@ -299,6 +302,22 @@ def _request_stop(socket_path: Path | None) -> tuple[bool, str | None]:
     except Exception as error:  # a hung or dying daemon must not look like a failure of the link
         return False, str(error) or type(error).__name__
     return False, None
+
+
+def _begin(request_stop: Callable[[], tuple[bool, str | None]]) -> Callable[[], tuple[bool, str | None]]:
+    """Ask the daemon in a thread, as the link may take its time; returns a function that waits for the outcome."""
+    outcomes: list[tuple[bool, str | None]] = []
+    asking = threading.Thread(target=lambda: outcomes.append(request_stop()), daemon=True)
+    try:
+        asking.start()
+    except RuntimeError:  # no thread can be made
+        return request_stop
+
+    def wait() -> tuple[bool, str | None]:
+        asking.join()
+        return outcomes[0]
+
+    return wait
 
 
 def stop_and_report(robot: Path, link: str | None, as_json: bool) -> int:

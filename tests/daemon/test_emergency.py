@@ -137,6 +137,28 @@ def test_a_state_on_the_bus_from_before_the_request_confirms_nothing(tmp_path, m
         assert stop_robot(robot_file(tmp_path, tmp_path / "none")).confirmed is confirmed
 
 
+@pytest.mark.parametrize("has_threads", [True, False])
+def test_the_daemon_is_asked_while_the_link_takes_its_time(tmp_path, daemon, monkeypatch, has_threads):
+    """As an adapter that only one process can open, which the daemon has: nothing comes of waiting for it."""
+
+    class HeldBus(Bus):
+        @property
+        def state(self):
+            return LinkState.UP if daemon.actions() else LinkState.CONNECTING
+
+    def fail(self):
+        raise RuntimeError("can't start new thread")
+
+    if not has_threads:
+        monkeypatch.setattr(emergency, "_CONNECT_S", 0.0)
+        monkeypatch.setattr(threading.Thread, "start", fail)
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
+    monkeypatch.setattr(emergency, "open_transport", lambda **_: HeldBus([]))
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path))
+    assert (outcome.link_error is None, outcome.daemon_error) == (has_threads, None)
+    assert daemon.actions()[0] == "estop"
+
+
 def frames_on(line, settle_s=0.1):
     """Return what comes on a line until there are frames in it and nothing follows within that time."""
     decoder, frames = FrameDecoder(), []
@@ -260,7 +282,7 @@ def test_the_stop_over_an_adapter_does_not_wait_for_a_daemon_that_has_just_faile
     is_out = []
 
     def request(_):
-        is_out.append(bool(select.select([robot_end], [], [], 0.0)[0]))
+        is_out.append(bool(select.select([robot_end], [], [], 60.0 if goes_at_once else 0.0)[0]))
         return False, "no answer"
 
     monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
