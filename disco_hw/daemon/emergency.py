@@ -28,7 +28,7 @@ from disco_hw.reports import as_json as json_of
 from drivers.motor import find_driver
 from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.transport import SerialMedium, open_transport
-from drivers.transport.can import OVER_A_TTY, write_to_held_slcan
+from drivers.transport.can import FOR_ONE_PROCESS, write_to_held_slcan
 from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
@@ -131,10 +131,10 @@ def stop_robot(
     way = _stop_over_exchange if is_exchange else _stop_over_serial if is_serial else _stop_over_transport
     address = settings.port if is_serial else f"{settings.interface} {settings.channel}"
     outcome = EstopOutcome(address, None, None, False, refused, file_error, driver.latches_stop)
-    if not daemon_failed and (is_exchange or (not is_serial and settings.interface in OVER_A_TTY)):
+    if not daemon_failed and (is_exchange or (not is_serial and settings.interface in FOR_ONE_PROCESS)):
         # Two that speak at once on a line of exchanges spoil each other's packets, and a second opening of an adapter
-        # closes its CAN channel under the daemon when it ends: the daemon first, which has the line. A daemon may hang,
-        # but frames can go at once into the channel that it has open.
+        # closes its CAN channel under the daemon: the daemon first, which has the line. A daemon may hang, but over
+        # slcan frames can go at once into the channel that it has open.
         if not is_exchange and settings.interface == "slcan":
             with contextlib.suppress(OSError):
                 write_to_held_slcan(settings.channel, ESTOP_REPEATS * tuple(frames))

@@ -56,9 +56,11 @@ _ECHO_OPTION = "receive_own_messages"
 _ECHOING_INTERFACES = frozenset({"udp_multicast", "gs_usb"})
 SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
 OVER_A_TTY = frozenset({"slcan", "serial", "seeedstudio", "robotell"})
-"""Interfaces over a serial port: who closes one of two openings may close the adapter's CAN channel for both."""
-MAY_STAY_MUTE = OVER_A_TTY | {"socketcand"}
-"""Interfaces over a serial port or a connection: these can be open and lead nowhere."""
+"""Interfaces over a serial port."""
+FOR_ONE_PROCESS = OVER_A_TTY | {"gs_usb"}
+"""Interfaces to an adapter whose CAN channel a second opening resets, or closes when it ends, for both."""
+MAY_STAY_MUTE = FOR_ONE_PROCESS | {"socketcand"}
+"""Interfaces that can be open and lead nowhere, without an error of the adapter, port or connection."""
 _NAMED_FIELDS = ("interface", "channel", "bitrate", "ignore_config")
 _GS_USB_DEVICE = {"index", "bus", "address"}
 _NEEDED_OPTIONS = {"socketcand": ("host", "port")}
@@ -168,7 +170,9 @@ class CanMedium:
         number = error_number(error)
         text = plain(error)
         if isinstance(error, LinkMuteError):
-            where = "the adapter (its number may have changed: use its name in /dev/serial/by-id)"
+            where = "the adapter"
+            if self.interface in OVER_A_TTY:
+                where += " (its number may have changed: use its name in /dev/serial/by-id)"
             text = f"{error}; check the robot's power, the bit rate and {where}"
         elif isinstance(error, LinkLostError):
             text = str(error)

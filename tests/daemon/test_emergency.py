@@ -269,6 +269,15 @@ def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_be
         assert {b"O", ESTOP_LINE, b"C"} <= set(os.read(robot_end, 4096).split(b"\r"))
 
 
+def test_a_usb_adapter_is_left_to_a_daemon_that_confirms(tmp_path, daemon, monkeypatch):
+    """To open a gs_usb adapter resets it, and to close it closes its channel, whoever else has it open."""
+    opened = []
+    monkeypatch.setattr(emergency, "open_transport", lambda **_: opened.append(1) or Bus([]))
+    daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link='interface = "gs_usb"'))
+    assert (outcome.confirmed, opened) == (True, [])
+
+
 @pytest.mark.parametrize(
     ("daemon_failed", "is_held", "goes_at_once"), [(True, False, True), (False, False, False), (False, True, True)]
 )
