@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import serial
@@ -39,6 +39,7 @@ _CONNECT_S = 1.0
 # Chosen: five periods of SYSTEM_STATE (0.1 s); slower confirmations are reported as missing.
 _CONFIRM_S = 0.5
 _IsConfirmation = Callable[[ReceivedFrame], bool]
+_T = TypeVar("_T")
 _HINT = (
     "to stop the robot all the same, give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's "
     "own e-stop button, now"
@@ -218,10 +219,10 @@ def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmatio
 def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
-    with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
+    port = open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False)
+    try:
         # Opening threw away what came in before. The delimiter ends what another sender may be in the middle of.
         port.write(b"\0" + ESTOP_REPEATS * b"".join(encode_frame(frame.can_id, frame.data) for frame in frames))
-        port.flush()
         decoder = FrameDecoder()
 
         def receive() -> list[ReceivedFrame]:
@@ -232,6 +233,9 @@ def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: 
             return []
 
         return _confirmed(receive, is_confirmation)
+    finally:
+        # While the other end takes nothing the kernel closes the port half a minute later: nobody waits for that.
+        _begin(port.close)
 
 
 def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
@@ -304,18 +308,19 @@ def _request_stop(socket_path: Path | None) -> tuple[bool, str | None]:
     return False, None
 
 
-def _begin(request_stop: Callable[[], tuple[bool, str | None]]) -> Callable[[], tuple[bool, str | None]]:
-    """Ask the daemon in a thread, as the link may take its time; returns a function that waits for the outcome."""
-    outcomes: list[tuple[bool, str | None]] = []
-    asking = threading.Thread(target=lambda: outcomes.append(request_stop()), daemon=True)
+def _begin(work: Callable[[], _T]) -> Callable[[], _T]:
+    """Do the work in a thread, or at once if none can be made; returns a function that waits for the result."""
+    results: list[_T] = []
+    thread = threading.Thread(target=lambda: results.append(work()), daemon=True)
     try:
-        asking.start()
-    except RuntimeError:  # no thread can be made
-        return request_stop
+        thread.start()
+    except RuntimeError:
+        results.append(work())
+        return results.pop
 
-    def wait() -> tuple[bool, str | None]:
-        asking.join()
-        return outcomes[0]
+    def wait() -> _T:
+        thread.join()
+        return results[0]
 
     return wait
 
