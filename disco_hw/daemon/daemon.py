@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -85,6 +86,7 @@ class Daemon:
         self._signals = signals
         self._pilot = pilot
         self._stolen_before_ms = processes.stolen_ms()
+        self._stolen_ms = 0
         self._quit = False
         self._failed = False
         self._next_second_ns = 0
@@ -259,8 +261,10 @@ class Daemon:
         last = self._core.last
         if last is not None:
             self._report_state(last)
-        stolen_ms = processes.stolen_ms() - self._stolen_before_ms
-        counted = counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms)
+        # Where no file can be opened any more the figure stays: the log must not end the drive.
+        with contextlib.suppress(OSError):
+            self._stolen_ms = processes.stolen_ms() - self._stolen_before_ms
+        counted = counters(self._core, self._loop.stats, self._recorder_stats, now_ns, self._stolen_ms)
         restored = self._server.restore()
         if restored is None:
             return (counted,)

@@ -1,9 +1,11 @@
 """The daemon on vendors' simulated controllers and in simulated time: how it stops the wheels, and what it answers."""
 
+import errno
 from types import SimpleNamespace
 
 import pytest
 
+from disco_hw import processes
 from disco_hw.daemon.daemon import Daemon
 from disco_hw.log.recorder import NullRecorder, RecorderStats
 from disco_hw.log.records import Event
@@ -224,3 +226,15 @@ def test_a_control_socket_that_was_removed_is_looked_for_every_second_and_record
     events = [(record.code, record.text) for record in recorded if type(record) is Event]
     assert events == [("control socket", "x.sock: was removed")]
     assert driven.daemon._recorder.restored == 1
+
+
+def test_a_drive_goes_on_without_a_free_descriptor_for_the_figures_of_its_log(tmp_path, monkeypatch):
+    driven = Driven(tmp_path, "vesc")
+    driven.daemon._recorder_stats = RecorderStats()
+
+    def fail():
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(processes, "stolen_ms", fail)
+    (counted,) = driven.daemon._every_second(1000 * MS)
+    assert counted.loop["stolen_ms"] == 0
