@@ -134,6 +134,9 @@ class Daemon:
         deadline_ns = self._clock.now_ns() + round((_STOP_LIMIT_S + ramp_s) * 1e9)
         period_ns = round(1e9 / core.config.control.rate_hz)
         while (now_ns := self._clock.now_ns()) < deadline_ns:
+            if self._suspend_watch.was_suspended():
+                # The ramp would go on from a speed that the robot had before, and has not any more.
+                core.renew_link()
             tick(now_ns)
             if core.driver.is_stop_over and is_over():
                 return
@@ -150,6 +153,7 @@ class Daemon:
         """Have the driver alone stop the robot, as the rest of the loop has failed; by the e-stop if it cannot."""
         driver, transport = self._core.driver, self._core.transport
         try:
+            self._core.follow_link(now_ns)
             driver.receive(now_ns, transport.receive())
             driver.request(Request.STANDBY)
             frames = driver.transmit(now_ns, None)

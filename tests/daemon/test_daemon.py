@@ -238,3 +238,29 @@ def test_a_drive_goes_on_without_a_free_descriptor_for_the_figures_of_its_log(tm
     monkeypatch.setattr(processes, "stolen_ms", fail)
     (counted,) = driven.daemon._every_second(1000 * MS)
     assert counted.loop["stolen_ms"] == 0
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_after_a_suspend_in_the_middle_of_a_stop_the_robot_does_not_move_again(tmp_path, name, failed, monkeypatch):
+    driven = Driven(tmp_path, name, SLOW.get(name, ""), coasting_s=0.2)
+    driven.drive()
+    looked, speeds_rad_s, sleep_until_ns = [], [], driven.sleep_until_ns
+
+    def was_suspended():
+        looked.append(True)
+        if len(looked) != 5:
+            return False
+        driven.suspend(3.0)
+        return True
+
+    def sleep(deadline_ns):
+        sleep_until_ns(deadline_ns)
+        if len(looked) >= 5:
+            speeds_rad_s.append(driven.rig.speed_rad_s)
+
+    monkeypatch.setattr(driven, "sleep_until_ns", sleep)
+    driven.daemon._suspend_watch = SimpleNamespace(was_suspended=was_suspended)
+    driven.daemon._failed = failed
+    driven.daemon.stop_wheels()
+    assert len(looked) >= 5
+    assert max(speeds_rad_s, default=0.0) < 0.1
