@@ -25,6 +25,7 @@ from disco_hw.daemon.loop import LoopStats
 from disco_hw.errors import InputError
 from disco_hw.log import records
 from disco_hw.log.recorder import RecorderStats
+from disco_hw.processes import DescriptorReserve
 from disco_hw.runtime.core import DaemonCore
 from disco_hw.runtime.robot_setup import limits, requested_task
 from drivers.private_files import why_not_private
@@ -84,6 +85,8 @@ class ControlServer:
             os.close(self._lock_fd)
             raise
         self._bound = _identity(path)
+        # For as many clients, and the one that comes before another is dropped for it.
+        self._reserve = DescriptorReserve(_MAX_CLIENTS + 1)
 
     def poll(self) -> list[ControlMessage]:
         """Accept, read and send what is possible at once; return the requests to act on, e-stops first.
@@ -146,14 +149,14 @@ class ControlServer:
             if _identity(self.path) == self._bound:
                 self.path.unlink(missing_ok=True)
             self._listener.close()
+            self._reserve.close()
             # The lock's file stays: removing it would let a third process lock a new file while a second holds this.
             os.close(self._lock_fd)
 
     def _accept(self) -> None:
         for _ in range(_ACCEPTS_PER_POLL):
-            try:
-                connection, _ = self._listener.accept()
-            except OSError:
+            connection = self._accept_one()
+            if connection is None:
                 return
             if peer_uid(connection) not in self._allowed_uids:
                 connection.close()
@@ -165,6 +168,18 @@ class ControlServer:
             self._accepted += 1
             self._activity += 1
             self._clients[self._accepted] = _Client(connection, self._activity)
+
+    def _accept_one(self) -> socket.socket | None:
+        """Accept a connection if one waits; with a reserved descriptor where there is no other, for an e-stop."""
+        with contextlib.suppress(OSError):
+            try:
+                return self._listener.accept()[0]
+            except BlockingIOError:
+                return None
+            except OSError:
+                with self._reserve.released():
+                    return self._listener.accept()[0]
+        return None
 
     def _read(self, number: int, client: _Client) -> None:
         if client.finished:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -88,6 +89,7 @@ class Daemon:
         self._signals = signals
         self._pilot = pilot
         self._stolen_before_ms = processes.stolen_ms()
+        self._stolen_ms = 0
         self._quit = False
         self._failed = False
         self._next_second_ns = 0
@@ -135,6 +137,9 @@ class Daemon:
         deadline_ns = self._clock.now_ns() + round((_STOP_LIMIT_S + ramp_s) * 1e9)
         period_ns = round(1e9 / core.config.control.rate_hz)
         while (now_ns := self._clock.now_ns()) < deadline_ns:
+            if self._suspend_watch.was_suspended():
+                # The ramp would go on from a speed that the robot had before, and has not any more.
+                core.renew_link()
             tick(now_ns)
             if core.driver.is_stop_over and is_over():
                 return
@@ -151,6 +156,7 @@ class Daemon:
         """Have the driver alone stop the robot, as the rest of the loop has failed; by the e-stop if it cannot."""
         driver, transport = self._core.driver, self._core.transport
         try:
+            self._core.follow_link(now_ns)
             driver.receive(now_ns, transport.receive())
             driver.request(Request.STANDBY)
             frames = driver.transmit(now_ns, None)
@@ -263,8 +269,10 @@ class Daemon:
         last = self._core.last
         if last is not None:
             self._report_state(last)
-        stolen_ms = processes.stolen_ms() - self._stolen_before_ms
-        counted = counters(self._core, self._loop.stats, self._recorder_stats, now_ns, stolen_ms)
+        # Where no file can be opened any more the figure stays: the log must not end the drive.
+        with contextlib.suppress(OSError):
+            self._stolen_ms = processes.stolen_ms() - self._stolen_before_ms
+        counted = counters(self._core, self._loop.stats, self._recorder_stats, now_ns, self._stolen_ms)
         restored = self._server.restore()
         if restored is None:
             return (counted,)

@@ -1,20 +1,21 @@
 """Stop the robot from outside, with as little as possible in the way.
 
-The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked as well; each
-way is tried whether or not the other worked. Only where the two would disturb each other is the daemon asked first, and
-the link is left to it if that stops the robot. A robot.toml whose other sections are broken still says where the link
-is; without one that can be read, the option --link does.
+The frame goes out on the link by a connection of its own, beside the daemon's, and the daemon is asked at the same
+time; each way is tried whether or not the other works. Only where the two would disturb each other is the daemon asked
+first, and the link is left to it if that stops the robot. A robot.toml whose other sections are broken still says where
+the link is; without one that can be read, the option --link does.
 """
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import serial
@@ -27,7 +28,7 @@ from disco_hw.reports import as_json as json_of
 from drivers.motor import find_driver
 from drivers.motor.vendor_parts import ESTOP_LIFE_NS, ESTOP_REPEATS
 from drivers.transport import SerialMedium, open_transport
-from drivers.transport.can import OVER_A_TTY
+from drivers.transport.can import FOR_ONE_PROCESS, write_to_held_slcan
 from drivers.transport.reconnecting import TransportCounters
 from drivers.transport.serial import EXCHANGE_READ_S, ExchangeConnection, open_port
 from drivers.types import Frame, LinkState, OutgoingFrame, ReceivedFrame
@@ -38,6 +39,7 @@ _CONNECT_S = 1.0
 # Chosen: five periods of SYSTEM_STATE (0.1 s); slower confirmations are reported as missing.
 _CONFIRM_S = 0.5
 _IsConfirmation = Callable[[ReceivedFrame], bool]
+_T = TypeVar("_T")
 _HINT = (
     "to stop the robot all the same, give --link can:INTERFACE:CHANNEL or --link serial:PORT, or use the robot's "
     "own e-stop button, now"
@@ -130,16 +132,22 @@ def stop_robot(
     way = _stop_over_exchange if is_exchange else _stop_over_serial if is_serial else _stop_over_transport
     address = settings.port if is_serial else f"{settings.interface} {settings.channel}"
     outcome = EstopOutcome(address, None, None, False, refused, file_error, driver.latches_stop)
-    if not daemon_failed and (is_exchange or (not is_serial and settings.interface in OVER_A_TTY)):
+    if not daemon_failed and (is_exchange or (not is_serial and settings.interface in FOR_ONE_PROCESS)):
         # Two that speak at once on a line of exchanges spoil each other's packets, and a second opening of an adapter
-        # closes its CAN channel under the daemon when it ends: the daemon first, which has the line.
+        # closes its CAN channel under the daemon: the daemon first, which has the line. A daemon may hang, but over
+        # slcan frames can go at once into the channel that it has open.
+        if not is_exchange and settings.interface == "slcan":
+            with contextlib.suppress(OSError):
+                write_to_held_slcan(settings.channel, ESTOP_REPEATS * tuple(frames))
         daemon_confirmed, daemon_error = _request_stop(socket_path)
         if daemon_confirmed or (is_exchange and daemon_error is None):
             return replace(outcome, link_error="left to the daemon, which holds the line", confirmed=daemon_confirmed)
         confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
     else:
+        request_stop = partial(_request_stop, socket_path)
+        await_daemon = request_stop if is_exchange else _begin(request_stop)
         confirmed, link_error = _attempt(partial(way, settings, frames, is_confirmation))
-        daemon_confirmed, daemon_error = _request_stop(socket_path)
+        daemon_confirmed, daemon_error = await_daemon()
     return replace(outcome, link_error=link_error, daemon_error=daemon_error, confirmed=confirmed or daemon_confirmed)
 
 
@@ -211,10 +219,10 @@ def _stop_over_transport(settings: Link, frames: Sequence[Frame], is_confirmatio
 def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
     # Not exclusive: the daemon may hold the port, and must not be able to keep the stop from the robot.
     medium = SerialMedium(settings.port, settings.baud, settings.dtr, settings.rts)
-    with open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False) as port:
+    port = open_port(medium, timeout_s=0.01, write_timeout_s=0.5, exclusive=False)
+    try:
         # Opening threw away what came in before. The delimiter ends what another sender may be in the middle of.
         port.write(b"\0" + ESTOP_REPEATS * b"".join(encode_frame(frame.can_id, frame.data) for frame in frames))
-        port.flush()
         decoder = FrameDecoder()
 
         def receive() -> list[ReceivedFrame]:
@@ -225,6 +233,9 @@ def _stop_over_serial(settings: Link, frames: Sequence[Frame], is_confirmation: 
             return []
 
         return _confirmed(receive, is_confirmation)
+    finally:
+        # While the other end takes nothing the kernel closes the port half a minute later: nobody waits for that.
+        _begin(port.close)
 
 
 def _stop_over_exchange(settings: Link, frames: Sequence[Frame], is_confirmation: _IsConfirmation) -> bool:
@@ -295,6 +306,23 @@ def _request_stop(socket_path: Path | None) -> tuple[bool, str | None]:
     except Exception as error:  # a hung or dying daemon must not look like a failure of the link
         return False, str(error) or type(error).__name__
     return False, None
+
+
+def _begin(work: Callable[[], _T]) -> Callable[[], _T]:
+    """Do the work in a thread, or at once if none can be made; returns a function that waits for the result."""
+    results: list[_T] = []
+    thread = threading.Thread(target=lambda: results.append(work()), daemon=True)
+    try:
+        thread.start()
+    except RuntimeError:
+        results.append(work())
+        return results.pop
+
+    def wait() -> _T:
+        thread.join()
+        return results[0]
+
+    return wait
 
 
 def stop_and_report(robot: Path, link: str | None, as_json: bool) -> int:

@@ -88,7 +88,8 @@ class ViewerFeed:
 
     def restore(self) -> None:
         """Make the socket again where its file was removed; who was connected stays so."""
-        if self._path.exists():
+        # That of Path raises where this user may not look.
+        if os.path.exists(self._path):
             return
         mask = os.umask(0o177)
         try:

@@ -394,7 +394,11 @@ class ProcessRecorder:
             continues=self._continues,
             continues_sequence=None if self._next_part == 1 else self._delivery.last_delivered,
         )
-        connection = self._keeper.launch(request)
+        fault = "the process that starts log writers has ended; disarm to restart it"
+        try:
+            connection = self._keeper.launch(request)
+        except LogError as error:
+            connection, fault = None, str(error)
         if connection is not None:
             self._line = WriterLine(connection, self._start.path, self._next_part)
             if self._delivery.states:
@@ -403,9 +407,7 @@ class ProcessRecorder:
             self._next_part = max(2, self._next_part)
         else:
             self._retry_s = time.monotonic() + _RETRY_S[-1]
-            self._fault = (
-                "nothing is being recorded: the process that starts log writers has ended; disarm to restart it"
-            )
+            self._fault = f"nothing is being recorded: {fault}"
             self._note(self._fault)
 
     def _recovered(self) -> None:

@@ -146,10 +146,16 @@ class KeeperLink:
         return not self.alive or (self._requested_s is not None and now_s - self._requested_s > _REPLY_TIMEOUT_S)
 
     def launch(self, request: Start) -> socket.socket | None:
-        """Ask for a writer; returns the recorder's end of the socket to it, or None without a keeper."""
+        """Ask for a writer; returns the recorder's end of the socket to it, or None without a keeper.
+
+        Raises LogError where this process may not open a socket.
+        """
         if self._channel is None:
             return None
-        ours, theirs = socket.socketpair()
+        try:
+            ours, theirs = socket.socketpair()
+        except OSError as error:
+            raise _refused(error) from None
         with theirs:
             ours.setblocking(False)
             ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
@@ -182,9 +188,12 @@ class KeeperLink:
                 self.code = message.code
 
     def renew(self) -> None:
-        """Start another keeper in place of this one; takes milliseconds. The writer lives on."""
+        """Start another keeper in place of this one; takes milliseconds. The writer lives on. Raises LogError."""
         self._end_process()
-        self._open_writer()
+        try:
+            self._open_writer()
+        except OSError as error:
+            raise _refused(error) from None
 
     def close(self) -> None:
         """Let the keeper end; safe to call twice."""
@@ -227,6 +236,10 @@ class KeeperLink:
             self._process.kill()
             self._process.wait()
             self._process = None
+
+
+def _refused(error: OSError) -> LogError:
+    return LogError(f"no log writer can be started ({error.strerror}); end what uses up this computer's open files")
 
 
 class _Parcel(NamedTuple):

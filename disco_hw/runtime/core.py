@@ -152,7 +152,7 @@ class DaemonCore:
         the robot does if the supervisor allows motion, `by_hand` with a person who sees it. Never raises on
         what the robot sent.
         """
-        self._follow_link(now_ns)
+        self.follow_link(now_ns)
         frames = self.transport.receive()
         readings = self.driver.receive(now_ns, frames)
         poses = self.pose_source.receive(now_ns, readings.poses)
@@ -247,7 +247,7 @@ class DaemonCore:
         """Have the driver begin anew with its robot in the next tick, as after a loss of the link."""
         self._link_renewed = True
 
-    def _follow_link(self, now_ns: int) -> None:
+    def follow_link(self, now_ns: int) -> None:
         """Notify the driver when the link comes and goes; a link renewed between two ticks is both."""
         up = self.transport.state is LinkState.UP
         renewed = self.transport.generation != self._generation or self._link_renewed

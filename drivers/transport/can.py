@@ -56,9 +56,11 @@ _ECHO_OPTION = "receive_own_messages"
 _ECHOING_INTERFACES = frozenset({"udp_multicast", "gs_usb"})
 SLCAN_BITRATES = (10_000, 20_000, 50_000, 83_300, 100_000, 125_000, 250_000, 500_000, 750_000, 1_000_000)
 OVER_A_TTY = frozenset({"slcan", "serial", "seeedstudio", "robotell"})
-"""Interfaces over a serial port: who closes one of two openings may close the adapter's CAN channel for both."""
-MAY_STAY_MUTE = OVER_A_TTY | {"socketcand"}
-"""Interfaces over a serial port or a connection: these can be open and lead nowhere."""
+"""Interfaces over a serial port."""
+FOR_ONE_PROCESS = OVER_A_TTY | {"gs_usb"}
+"""Interfaces to an adapter whose CAN channel a second opening resets, or closes when it ends, for both."""
+MAY_STAY_MUTE = FOR_ONE_PROCESS | {"socketcand"}
+"""Interfaces that can be open and lead nowhere, without an error of the adapter, port or connection."""
 _NAMED_FIELDS = ("interface", "channel", "bitrate", "ignore_config")
 _GS_USB_DEVICE = {"index", "bus", "address"}
 _NEEDED_OPTIONS = {"socketcand": ("host", "port")}
@@ -168,7 +170,9 @@ class CanMedium:
         number = error_number(error)
         text = plain(error)
         if isinstance(error, LinkMuteError):
-            where = "the adapter (its number may have changed: use its name in /dev/serial/by-id)"
+            where = "the adapter"
+            if self.interface in OVER_A_TTY:
+                where += " (its number may have changed: use its name in /dev/serial/by-id)"
             text = f"{error}; check the robot's power, the bit rate and {where}"
         elif isinstance(error, LinkLostError):
             text = str(error)
@@ -344,6 +348,26 @@ def lock_port(channel: str) -> int:
         os.close(port)
         raise
     return port
+
+
+def write_to_held_slcan(channel: str, frames: Sequence[Frame]) -> None:
+    """Write frames to an slcan adapter that another process holds, whose CAN channel stays as it is; else do nothing.
+
+    Raises OSError where the port is absent or takes nothing more.
+    """
+    port = os.open(channel.partition("@")[0], os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    try:
+        fcntl.flock(port, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lines = [
+            f"{f'T{frame.can_id:08X}' if frame.extended else f't{frame.can_id:03X}'}"
+            f"{len(frame.data)}{frame.data.hex().upper()}"
+            for frame in frames
+        ]
+        # The first return ends what the other process may be in the middle of.
+        os.write(port, "\r".join(["", *lines, ""]).encode())
+    finally:
+        os.close(port)
 
 
 def require_server(host: str, port: int) -> None:

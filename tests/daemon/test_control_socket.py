@@ -1,5 +1,6 @@
 import json
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -54,6 +55,29 @@ def assert_takes_an_estop(server):
     with connect(server) as client:
         send(client, {"do": "estop"})
         assert polled(server) == ["estop"]
+
+
+@contextmanager
+def without_a_free_descriptor():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (256, hard))
+    taken = []
+    try:
+        with suppress(OSError):
+            while True:
+                taken.append(os.dup(0))
+        yield
+    finally:
+        for descriptor in taken:
+            os.close(descriptor)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def test_an_estop_gets_in_where_no_file_can_be_opened_any_more(server):
+    with connect(server) as first, connect(server) as second, without_a_free_descriptor():
+        for client in (first, second):
+            send(client, {"do": "estop"})
+            assert polled(server) == ["estop"]
 
 
 def hung_up(connection):

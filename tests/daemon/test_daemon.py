@@ -1,9 +1,11 @@
 """The daemon on vendors' simulated controllers and in simulated time: how it stops the wheels, and what it answers."""
 
+import errno
 from types import SimpleNamespace
 
 import pytest
 
+from disco_hw import processes
 from disco_hw.daemon.daemon import Daemon
 from disco_hw.log.recorder import NullRecorder, RecorderStats
 from disco_hw.log.records import Event
@@ -229,3 +231,41 @@ def test_a_control_socket_that_was_removed_is_looked_for_every_second_and_record
     events = [(record.code, record.text) for record in recorded if type(record) is Event]
     assert events == [("control socket", "x.sock: was removed")]
     assert driven.daemon._recorder.restored == 1
+
+
+def test_a_drive_goes_on_without_a_free_descriptor_for_the_figures_of_its_log(tmp_path, monkeypatch):
+    driven = Driven(tmp_path, "vesc")
+    driven.daemon._recorder_stats = RecorderStats()
+
+    def fail():
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(processes, "stolen_ms", fail)
+    (counted,) = driven.daemon._every_second(1000 * MS)
+    assert counted.loop["stolen_ms"] == 0
+
+
+@pytest.mark.parametrize("failed", [False, True])
+def test_after_a_suspend_in_the_middle_of_a_stop_the_robot_does_not_move_again(tmp_path, name, failed, monkeypatch):
+    driven = Driven(tmp_path, name, SLOW.get(name, ""), coasting_s=0.2)
+    driven.drive()
+    looked, speeds_rad_s, sleep_until_ns = [], [], driven.sleep_until_ns
+
+    def was_suspended():
+        looked.append(True)
+        if len(looked) != 5:
+            return False
+        driven.suspend(3.0)
+        return True
+
+    def sleep(deadline_ns):
+        sleep_until_ns(deadline_ns)
+        if len(looked) >= 5:
+            speeds_rad_s.append(driven.rig.speed_rad_s)
+
+    monkeypatch.setattr(driven, "sleep_until_ns", sleep)
+    driven.daemon._suspend_watch = SimpleNamespace(was_suspended=was_suspended)
+    driven.daemon._failed = failed
+    driven.daemon.stop_wheels()
+    assert len(looked) >= 5
+    assert max(speeds_rad_s, default=0.0) < 0.1

@@ -26,6 +26,8 @@ from tests.daemon.control_daemon import ControlDaemon
 SHIPPED = SHIPPED_ROBOT.read_text(encoding="utf-8")
 
 UART_NODE = 51
+_ESTOP_ID, _ESTOP_DATA = Codec().encode("ESTOP", reason=1)
+ESTOP_LINE = f"t{_ESTOP_ID:03X}{len(_ESTOP_DATA)}{_ESTOP_DATA.hex().upper()}".encode()
 STATE = {
     "state": "ESTOP", "fault": "NONE", "session": 0, "estop_source": "FRAME", "last_command_counter": 0,
     "rejected_count": 0, "reject_reason": "NONE", "stop_cause": "NONE",
@@ -135,6 +137,27 @@ def test_a_state_on_the_bus_from_before_the_request_confirms_nothing(tmp_path, m
         assert stop_robot(robot_file(tmp_path, tmp_path / "none")).confirmed is confirmed
 
 
+@pytest.mark.parametrize("has_threads", [True, False])
+def test_the_daemon_is_asked_while_the_link_takes_its_time(tmp_path, daemon, monkeypatch, has_threads):
+    """As an adapter that only one process can open, which the daemon has: nothing comes of waiting for it."""
+
+    class HeldBus(Bus):
+        @property
+        def state(self):
+            return LinkState.UP if daemon.actions() else LinkState.CONNECTING
+
+    def fail(self):
+        raise RuntimeError("can't start new thread")
+
+    if not has_threads:
+        monkeypatch.setattr(threading.Thread, "start", fail)
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
+    monkeypatch.setattr(emergency, "open_transport", lambda **_: HeldBus([]))
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path))
+    assert (outcome.link_error, outcome.daemon_error) == (None, None)
+    assert daemon.actions()[0] == "estop"
+
+
 def frames_on(line, settle_s=0.1):
     """Return what comes on a line until there are frames in it and nothing follows within that time."""
     decoder, frames = FrameDecoder(), []
@@ -161,6 +184,31 @@ def test_a_state_on_the_serial_line_from_before_the_request_confirms_nothing(tmp
     answering.start()
     assert stop_robot(robot, "serial").confirmed
     answering.join()
+
+
+def test_a_port_whose_other_end_takes_nothing_is_not_waited_for(tmp_path, daemon, monkeypatch):
+    """As of a controller with a USB port of its own, whose firmware hangs: what was written stays in this computer."""
+    written, drained = [], threading.Event()
+
+    class StuckPort:
+        in_waiting, write = 0, written.append
+
+        def flush(self):
+            raise AssertionError("waits without end")
+
+        def close(self):
+            drained.wait(60.0)
+
+        def read(self, size):
+            return b""
+
+    monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
+    monkeypatch.setattr(emergency, "open_port", lambda *_, **__: StuckPort())
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path), "serial")
+    assert (len(written), outcome.link_error, outcome.confirmed) == (1, None, False)
+    assert daemon.actions()[0] == "estop"
+    assert not drained.is_set()
+    drained.set()
 
 
 BROKEN = {
@@ -239,20 +287,35 @@ def test_an_adapter_behind_a_tty_is_left_to_a_daemon_that_confirms_and_opened_be
     assert (daemon.actions()[0], outcome.sent, outcome.confirmed) == ("estop", True, confirmed)
     if confirmed:
         assert "left to the daemon" in outcome.link_error
-        assert not select.select([robot_end], [], [], 0.0)[0], "nobody else opens the adapter"
+        assert set(os.read(robot_end, 4096).split(b"\r")) == {b"", ESTOP_LINE}, "nobody else opens the adapter"
     else:
         assert outcome.link_error is None
-        assert b"\rt080" in os.read(robot_end, 4096)
+        assert {b"O", ESTOP_LINE, b"C"} <= set(os.read(robot_end, 4096).split(b"\r"))
 
 
-@pytest.mark.parametrize("daemon_failed", [True, False])
-def test_the_stop_does_not_wait_for_a_daemon_that_has_just_failed_to_answer(tmp_path, line, monkeypatch, daemon_failed):
+def test_a_usb_adapter_is_left_to_a_daemon_that_confirms(tmp_path, daemon, monkeypatch):
+    """To open a gs_usb adapter resets it, and to close it closes its channel, whoever else has it open."""
+    opened = []
+    monkeypatch.setattr(emergency, "open_transport", lambda **_: opened.append(1) or Bus([]))
+    daemon.status = {**daemon.status, "robot_state": "ESTOP", "robot_state_ns": time.monotonic_ns() + 10**10}
+    outcome = stop_robot(robot_file(tmp_path, daemon.server.path, link='interface = "gs_usb"'))
+    assert (outcome.confirmed, opened) == (True, [])
+
+
+@pytest.mark.parametrize(
+    ("daemon_failed", "is_held", "goes_at_once"), [(True, False, True), (False, False, False), (False, True, True)]
+)
+def test_the_stop_over_an_adapter_does_not_wait_for_a_daemon_that_has_just_failed_or_holds_it(
+    tmp_path, line, monkeypatch, daemon_failed, is_held, goes_at_once
+):
     robot_end, host_end = line
     tty.setraw(host_end)
+    if is_held:
+        fcntl.flock(host_end, fcntl.LOCK_EX)
     is_out = []
 
     def request(_):
-        is_out.append(bool(select.select([robot_end], [], [], 0.0)[0]))
+        is_out.append(bool(select.select([robot_end], [], [], 60.0 if goes_at_once else 0.0)[0]))
         return False, "no answer"
 
     monkeypatch.setattr(emergency, "_CONFIRM_S", 0.05)
@@ -260,7 +323,7 @@ def test_the_stop_does_not_wait_for_a_daemon_that_has_just_failed_to_answer(tmp_
     channel = {"/tmp/disco-hw-wombot.can": os.ttyname(host_end)}
     robot = robot_file(tmp_path, tmp_path / "none", link='interface = "slcan"', **channel)
     outcome = stop_robot(robot, daemon_failed=daemon_failed)
-    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [daemon_failed])
+    assert (outcome.link_error, outcome.daemon_error, is_out) == (None, "no answer", [goes_at_once])
 
 
 @pytest.mark.parametrize("option", ["radio", "can:", "can:socketcan", "can::can0", "can:socketcan:", "serial:"])

@@ -185,6 +185,18 @@ def test_a_socket_that_was_removed_is_made_again_for_its_owner_alone(feed, path)
     assert feed.refused == 1
 
 
+def test_a_directory_that_somebody_else_has_put_in_its_place_ends_no_drive(feed, path, monkeypatch):
+    def fail(*_, **__):
+        raise PermissionError
+
+    path.unlink()
+    path.parent.rename(path.parent.with_name("gone"))
+    with monkeypatch.context() as without:
+        without.setattr(type(path), "stat", fail)
+        feed.restore()
+    assert feed.refused == 1
+
+
 def test_the_socket_is_its_owners_alone(feed, path):
     assert path.is_socket()
     assert stat.S_IMODE(path.stat().st_mode) & 0o077 == 0

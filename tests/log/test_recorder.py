@@ -1,3 +1,4 @@
+import errno
 import os
 import re
 import shutil
@@ -9,7 +10,7 @@ import pytest
 
 from disco_hw.daemon.run import close_recorder
 from disco_hw.errors import LogError
-from disco_hw.log import writer_link
+from disco_hw.log import process_recorder, writer_link
 from disco_hw.log.log_command import info
 from disco_hw.log.process_recorder import ProcessRecorder, wall_offset_ns
 from disco_hw.log.reader import open_log
@@ -76,6 +77,25 @@ def kept_going_after_both_died(recorder):
     for process in (recorder.keeper_pid, recorder.writer_pid):
         os.kill(process, signal.SIGKILL)
     return kept_going(recorder, 6, lambda stats: "disarm to restart" in stats.fault)
+
+
+def test_without_a_free_descriptor_what_has_died_is_reported_and_replaced_once_there_is_one(path, monkeypatch):
+    def fail(*_):
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(process_recorder, "_RETRY_S", (0.0, 0.01))
+    recorder = ProcessRecorder(recording(path))
+    following = kept_going(recorder, 1, lambda stats: stats.delivered_ticks > 5)
+    with monkeypatch.context() as without:
+        without.setattr(writer_link.socket, "socketpair", fail)
+        os.kill(recorder.writer_pid, signal.SIGKILL)
+        following = kept_going(recorder, following, lambda stats: "(Too many open files)" in stats.fault)
+        os.kill(recorder.keeper_pid, signal.SIGKILL)
+        following = kept_going(recorder, following, lambda stats: "has ended" in stats.fault)
+        recorder.repair()
+    recorder.repair()
+    following = kept_going(recorder, following, lambda stats: not stats.fault)
+    assert all_accounted(recorder.close(), following - 1)
 
 
 def all_accounted(stats, given):

@@ -73,6 +73,13 @@ class Bench:
         assert self.out.state is State.READY
         return self
 
+    def arming(self):
+        self.ready().robot_obeys = False
+        self.tick(ARM)
+        self.tick(driver_state=DriverState.ARMING)
+        assert self.out.state is State.READY
+        return self
+
     def armed(self):
         self.ready().tick(ARM)
         self.tick(count=3)

@@ -109,7 +109,7 @@ def test_a_fault_of_the_robot_is_followed_by_this_hosts_reset_without_another_re
     assert refusal(bench.tick(ARM)).endswith(ending)
 
 
-@pytest.mark.parametrize("start", STARTS)
+@pytest.mark.parametrize("start", [*STARTS, "arming"])
 def test_estop_means_fault_in_the_same_tick_and_its_frames_until_the_robot_shows_it(start):
     bench = bench_in(start)
     bench.robot_obeys = False

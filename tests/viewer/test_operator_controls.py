@@ -13,6 +13,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
+from disco_hw.daemon.emergency import EstopOutcome
 from disco_hw.viewer import operator_controls as desk_module
 from disco_hw.viewer.operator_controls import Desk, shown
 from disco_hw.viewer.server import serving
@@ -169,6 +170,14 @@ def test_without_a_daemon_the_estop_takes_the_link_and_says_if_that_failed(tmp_p
         assert "NOT SENT" in request_reply(line, do="estop")["error"]
 
 
+def test_an_estop_goes_to_the_link_at_once_where_the_daemon_has_just_failed(tmp_path, monkeypatch):
+    given, outcome = [], EstopOutcome("link", None, None, True)
+    monkeypatch.setattr(desk_module, "stop_robot", lambda *_, **options: given.append(options) or outcome)
+    with closing(Desk(tmp_path / "none.sock", ROBOT_FILE)) as desk:
+        assert desk.estop()["ok"]
+    assert given == [{"daemon_failed": True}]
+
+
 def test_the_estop_takes_the_link_that_the_daemon_was_given(tmp_path):
     master, slave = pty.openpty()
     robot = robot_elsewhere(tmp_path)
@@ -310,6 +319,12 @@ def test_without_a_status_it_says_why(status, error, expected):
     display = shown(status, error)
     assert not display["ok"]
     assert expected in display["detail"]
+
+
+def test_a_daemon_that_has_gone_since_is_shown_and_no_older_status(daemon, line):
+    wait_until(lambda: next_message(line, "status")["ok"], 60.0)
+    daemon.close()
+    wait_until(lambda: next_message(line, "status")["state"] == "NO DAEMON", 60.0)
 
 
 def test_what_is_not_recorded_is_shown_whatever_the_state():

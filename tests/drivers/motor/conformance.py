@@ -147,11 +147,16 @@ class DriverConformance:
         assert bench.largest_speed_in(1.0) == 0.0
         bench.arm()
 
-    @pytest.mark.parametrize("armed", [False, True])
-    def test_the_hosts_emergency_stop_latches_in_any_state(self, bench, armed):
+    @pytest.mark.parametrize("when", ["standby", "arming", "armed", "stopping"])
+    def test_the_hosts_emergency_stop_latches_in_any_state(self, bench, when):
         bench.run_until(*IDLE_STATES)
-        if armed:
+        if when == "arming":
+            bench.request(Request.ARM).run_until(DriverState.ARMING)
+        if when in ("armed", "stopping"):
             bench.drive(0.5, FORWARD)
+        if when == "stopping":
+            bench.request(Request.STANDBY).run_until(DriverState.STOPPING)
+        assert bench.driver.state.value == when
         bench.send_estop()
         bench.run(self.stop_time_s(max(FORWARD)))
         assert bench.robot.speed_rad_s < 0.05

@@ -3,6 +3,7 @@ from contextlib import closing
 import pytest
 
 from drivers.transport import TransportSettingsError, can, create_transport, open_transport
+from drivers.transport.reconnecting import MUTE_AFTER_S
 from drivers.types import LinkState
 
 
@@ -37,7 +38,10 @@ def test_an_interface_without_its_package_says_what_to_install(monkeypatch, inte
 
 def test_an_interface_with_its_package_is_not_refused(monkeypatch):
     monkeypatch.setattr(can, "find_spec", lambda module: object())
-    assert create_transport("can", interface="gs_usb", channel="0").name == "gs_usb 0"
+    transport = create_transport("can", interface="gs_usb", channel="0")
+    assert transport.name == "gs_usb 0"
+    # Its library takes an adapter that was reset or unplugged for one that receives nothing.
+    assert transport._mute_after_s == MUTE_AFTER_S
 
 
 @pytest.mark.parametrize(
