@@ -137,7 +137,7 @@ class Daemon:
         deadline_ns = self._clock.now_ns() + round((_STOP_LIMIT_S + ramp_s) * 1e9)
         period_ns = round(1e9 / core.config.control.rate_hz)
         while (now_ns := self._clock.now_ns()) < deadline_ns:
-            if self._suspend_watch.was_suspended():
+            if self._suspend_watch.suspended_s():
                 # The ramp would go on from a speed that the robot had before, and has not any more.
                 core.renew_link()
             tick(now_ns)

@@ -251,12 +251,12 @@ def test_after_a_suspend_in_the_middle_of_a_stop_the_robot_does_not_move_again(t
     driven.drive()
     looked, speeds_rad_s, sleep_until_ns = [], [], driven.sleep_until_ns
 
-    def was_suspended():
+    def suspended_s():
         looked.append(True)
         if len(looked) != 5:
-            return False
+            return 0.0
         driven.suspend(3.0)
-        return True
+        return 3.0
 
     def sleep(deadline_ns):
         sleep_until_ns(deadline_ns)
@@ -264,7 +264,7 @@ def test_after_a_suspend_in_the_middle_of_a_stop_the_robot_does_not_move_again(t
             speeds_rad_s.append(driven.rig.speed_rad_s)
 
     monkeypatch.setattr(driven, "sleep_until_ns", sleep)
-    driven.daemon._suspend_watch = SimpleNamespace(was_suspended=was_suspended)
+    driven.daemon._suspend_watch = SimpleNamespace(suspended_s=suspended_s)
     driven.daemon._failed = failed
     driven.daemon.stop_wheels()
     assert len(looked) >= 5
