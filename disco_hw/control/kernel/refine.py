@@ -109,6 +109,21 @@ class Buffers(NamedTuple):
 
 
 @block_function
+def _fill(row: Array, value: float) -> None:
+    """Set all numbers of a row: by a loop, as numba takes a second to compile a kernel's assignments to slices."""
+    for n in range(row.shape[0]):
+        row[n] = value
+
+
+@block_function
+def _copy(source: Array, target: Array) -> None:
+    """Copy rows of commands (N, 2), by a loop as `_fill`."""
+    for n in range(source.shape[0]):
+        for c in range(CHANNELS):
+            target[n, c] = source[n, c]
+
+
+@block_function
 def _begin(states: Array, start: Array, base: Base) -> None:
     """Set row 0 of the states to the start."""
     cos_yaw, sin_yaw = math.cos(start[2]), math.sin(start[2])
@@ -322,10 +337,11 @@ def _move_within(problem: Problem, buffers: Buffers) -> None:
     inverse, step_, multipliers = buffers.inverse, buffers.step, buffers.multipliers
     commands, history = buffers.commands, problem.history
     for a in range(size):
-        inverse[a, :] = 0.0
+        _fill(inverse[a], 0.0)
         inverse[a, a] = 1.0
         _solve(buffers.normal, inverse[a])
-    multipliers[:, :] = 0.0
+    for side in range(2):
+        _fill(multipliers[side], 0.0)
     for _ in range(SWEEPS):
         for row in range(2 * size):
             # Rows below `size` bound a command, those above its change.
@@ -375,15 +391,15 @@ def _choose_start(problem: Problem, buffers: Buffers, count: int) -> float:
     """Set the plan to the cheapest of the first `count` starts, brought within the limits; returns its cost."""
     plan, starts = buffers.commands[problem.history :], buffers.starts
     best, least = 0, math.inf
-    buffers.step[:] = 0.0
+    _fill(buffers.step, 0.0)
     for n in range(count):
-        plan[:, :] = starts[n]
+        _copy(starts[n], plan)
         _apply_step(problem, buffers, 0.0)
-        starts[n] = buffers.tried[problem.history :]
+        _copy(buffers.tried[problem.history :], starts[n])
         cost = _cost(problem, buffers, buffers.tried)
         if cost < least:
             best, least = n, cost
-    plan[:, :] = starts[best]
+    _copy(starts[best], plan)
     return least
 
 
@@ -407,7 +423,7 @@ def refine(problem: Problem, buffers: Buffers, count: int, iterations: int) -> f
             tried = _cost(problem, buffers, buffers.tried)
             if tried < cost:
                 cost, improved = tried, True
-                buffers.commands[:, :] = buffers.tried
+                _copy(buffers.tried, buffers.commands)
                 break
             share *= 0.5
         if not improved:
