@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.jit import block_function, kernel_function, scalar_function
@@ -138,7 +139,10 @@ def _roll(
     states: Array, first: int, commands: Array, history: int, time_s: float, drift: Array, lateral: LateralLag,
     remembered: Array | None, base: Base, effects: Coefficients, integration: Integration,
 ) -> None:  # fmt: skip
-    """Fill the rows of `states` behind row `first` from that row."""
+    """Fill the rows of `states` behind row `first` from that row.
+
+    `first` is no literal, for which numba would compile a form of its own.
+    """
     first_input = history - delay_steps(effects)
     for t in range(first, states.shape[0] - 1):
         recent, older = max(t + first_input, 0), max(t + first_input - 1, 0)
@@ -201,8 +205,8 @@ def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
     _store_memory(buffers.remembered, problem.means)
     _begin(states, problem.start, base)
     _roll(
-        states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
-        integration,
+        states, np.int64(0), commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered,
+        base, effects, integration,
     )  # fmt: skip
     turned = _last_residual(problem, states)
     cost = turned * turned
@@ -230,8 +234,8 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     _store_memory(buffers.remembered, problem.means)
     _begin(states, problem.start, base)
     _roll(
-        states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
-        integration,
+        states, np.int64(0), commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered,
+        base, effects, integration,
     )  # fmt: skip
     for t in range(steps):
         residuals[RESIDUALS * t], residuals[RESIDUALS * t + 1] = _residual(problem, states, t)
