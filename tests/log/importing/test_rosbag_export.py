@@ -17,8 +17,7 @@ from disco_hw.log.importing import import_log
 from disco_hw.log.importing.rosbag import read_rosbag
 from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export_rosbag, write_rosbag
-from tests.inference.drives import logged, robot_config, write_log
-from tests.inference.test_infer_command import ROBOT
+from tests.inference.drives import ROBOT, logged, robot_config, write_log
 from tests.log.importing.commands import call
 
 
