@@ -5,41 +5,31 @@ What the tests of one file alone need is not here: these compile it themselves.
 
 from __future__ import annotations
 
-import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
 
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.control import CommandLimits, Disco, DiscoSettings
-from disco_hw.effects.registry import MOTION_EFFECTS, REGISTRY
 from disco_hw.gap import missing_effects
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
 from disco_hw.inference.noise import USUAL
 from disco_hw.inference.simulate import Simulator
-from disco_hw.model import EffectSetting, Model
+from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
 from disco_hw.runtime.assembly import create_planner
 from disco_hw.runtime.robot_setup import load_setup
 from disco_hw.tasks import task_from
 from disco_hw.tasks.line import Waypoints
 from disco_hw.tasks.timed_path import TimedPathCost
+from tools.every_effect import model_with_every_effect
 from tools.gap.logs import simulated_drive
 
 PROCESSORS = 2
 CORNER = Waypoints(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]), np.array([0.0, 5.0, 10.0]))
-
-
-def model_with_every_effect(values: Mapping[str, Mapping[str, float]], base: tuple[float, float, float]) -> Model:
-    """A model whose free run is kept, with these effects; all others are there too, and do nothing."""
-    neutral = {
-        name: {p.name: p.high if math.isinf(p.neutral) else p.neutral for p in REGISTRY[name].parameters}
-        for name in MOTION_EFFECTS
-    }
-    return Model(*base, effects=tuple(EffectSetting(name, dict(of)) for name, of in (neutral | dict(values)).items()))
 
 
 def plan_the_shipped_tasks() -> None:

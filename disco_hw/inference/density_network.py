@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.optim.adamw import adamw
 
 from disco_hw.inference.simulate import LocalWorkers, Seeds, Workers, draw_seeds
 
@@ -236,31 +237,41 @@ def _fit(stack: _Stack, x: torch.Tensor, y: torch.Tensor, settings: NetworkSetti
     validation, training = order[:, :validation_count], order[:, validation_count:]
     valid_x, valid_y = x[validation], y[validation]
     batches = max(1, training.shape[1] // _BATCH)
-    optimiser = torch.optim.AdamW(stack.parameters(), lr=settings.rate, weight_decay=settings.decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs)
+    parameters: list[torch.Tensor] = list(stack.parameters())
+    rate = settings.rate
+    moments, squares = ([torch.zeros_like(parameter) for parameter in parameters] for _ in range(2))
+    steps = [torch.tensor(0.0) for _ in parameters]
     best = torch.full((members,), -math.inf)
     since = torch.zeros(members)
-    kept = [parameter.detach().clone() for parameter in stack.parameters()]
-    for _ in range(settings.epochs):
+    kept = [parameter.detach().clone() for parameter in parameters]
+    for epoch in range(settings.epochs):
         shuffled = torch.stack([row[torch.randperm(row.shape[0])] for row in training])
         for batch in shuffled.tensor_split(batches, dim=1):
-            optimiser.zero_grad(set_to_none=True)
+            stack.zero_grad()
             loss = -stack.log_density(x[batch], y[batch]).mean(dim=1).sum()
             loss.backward()  # type: ignore[no-untyped-call]
-            torch.nn.utils.clip_grad_norm_(stack.parameters(), _CLIP_NORM * math.sqrt(members))
-            optimiser.step()
-        schedule.step()
+            torch.nn.utils.clip_grad_norm_(parameters, _CLIP_NORM * math.sqrt(members))
+            gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
+            # As a function: torch's class for it loads torch's compiler, for which each process waits a second or more.
+            with torch.no_grad():
+                adamw(
+                    parameters, gradients, moments, squares, [], steps, amsgrad=False, beta1=0.9, beta2=0.999, lr=rate,
+                    weight_decay=settings.decay, eps=1e-8, maximize=False,
+                )  # fmt: skip
+        # Along a cosine to zero.
+        before, after = (1.0 + math.cos(math.pi * (epoch + n) / settings.epochs) for n in range(2))
+        rate *= after / before
         with torch.no_grad():
             score = stack.log_density(valid_x, valid_y).mean(dim=1)
         better = score > best
         best = torch.where(better, score, best)
         since = torch.where(better, torch.zeros_like(since), since + 1)
-        for copy, parameter in zip(kept, stack.parameters(), strict=True):
+        for copy, parameter in zip(kept, parameters, strict=True):
             copy[better] = parameter.detach()[better]
         if bool((since >= settings.patience).all()):
             break
     with torch.no_grad():
-        for copy, parameter in zip(kept, stack.parameters(), strict=True):
+        for copy, parameter in zip(kept, parameters, strict=True):
             parameter.copy_(copy)
 
 

@@ -10,12 +10,10 @@ from dataclasses import replace
 import pytest
 from numba import njit
 
-from disco_hw import gap
-from disco_hw.cli import logs, robot
+from disco_hw.cli import robot
 from disco_hw.config import SHIPPED_ROBOT
 from disco_hw.daemon import check, run
 from disco_hw.daemon.run import compile_beforehand, compile_progress
-from disco_hw.inference import infer_command
 from disco_hw.model import EffectSetting, load_model, save_model
 from tests.tables import thinned
 
@@ -147,19 +145,10 @@ class Result:
         return ""
 
 
-@pytest.mark.parametrize(
-    ("verb", "model"),
-    [
-        (lambda out: robot.check(SHIPPED_ROBOT), lambda _: None),
-        (lambda out: logs.gap([SHIPPED_ROBOT], SHIPPED_ROBOT, out), lambda out: out / "model.toml"),
-        (lambda out: logs.infer([SHIPPED_ROBOT], SHIPPED_ROBOT, out), lambda out: out),
-    ],
-    ids=["check", "gap", "infer"],
-)
-def test_check_gap_and_infer_compile_for_the_model_that_they_read_or_wrote(tmp_path, monkeypatch, verb, model):
+# What `gap` and `infer` write is compiled for too, as is tested beside their other tests.
+def test_check_compiles_for_the_model_that_it_read(monkeypatch):
     models = []
-    for module, name in ((check, "run_check"), (gap, "gap"), (infer_command, "infer_command")):
-        monkeypatch.setattr(module, name, lambda *_: Result())
+    monkeypatch.setattr(check, "run_check", lambda *_: Result())
     monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, report: models.append(model))
-    verb(tmp_path)
-    assert models == [model(tmp_path)]
+    robot.check(SHIPPED_ROBOT)
+    assert models == [None]

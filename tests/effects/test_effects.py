@@ -14,7 +14,7 @@ from disco_hw.model.step import FreeRun
 from drivers.pose import PoseConvention
 from drivers.types import PoseSample
 from tests.model.reference import reference_run
-from tools.compile_kernels import model_with_every_effect
+from tools.every_effect import model_with_every_effect
 
 NAMES = {
     Channel.COMMAND_TO_WHEEL: {

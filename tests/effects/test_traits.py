@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from disco_hw.effects import Stage, Symptom, arguments_of
+from disco_hw.effects import Stage, arguments_of
 from disco_hw.effects.registry import REGISTRY, in_stages
-from disco_hw.inference.checks import CHECKS
 
 GEOMETRY = (0.06, 0.4, 0.1)
 TOP_RAD_S = 6.0
@@ -73,11 +72,6 @@ def test_what_makes_wheels_late_is_a_time():
         (unit,) = [parameter.unit for parameter in effect.parameters if parameter.name == effect.delayed_by]
         assert unit == "s"
         assert effect.delay_starts
-
-
-def test_every_symptom_is_tested_for_and_some_effect_shows_it():
-    assert {check.symptom for check in CHECKS} == set(Symptom)
-    assert all(check.effects for check in CHECKS)
 
 
 def test_stages_come_one_after_the_other_whatever_the_order_of_their_effects():

@@ -9,8 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from disco_hw import gap
-from disco_hw.cli import app
+from disco_hw.cli import app, logs
 from disco_hw.config import SHIPPED_ROBOT, load_robot_config
+from disco_hw.daemon import run
 from disco_hw.effects.registry import REGISTRY
 from disco_hw.errors import InputError, LogError
 from disco_hw.gap.report import STAGES, EffectFinding, FleetRow, GapReport, LowConfidence, UnnamedFinding
@@ -209,6 +210,14 @@ def test_a_fleet_shows_the_errors_of_the_model_that_is_in_the_directory(offered,
     whole = replace(found, gap=found.gap | {"written": found.gap["refitted"]})
     for judged in (whole, replace(whole, gap={}, wheels=whole.gap)):
         assert FleetRow(Path("drive.mcap"), Path("out/drive"), judged).cells()[5] == shown
+
+
+def test_a_planner_is_compiled_for_the_model_that_was_written(tmp_path, monkeypatch):
+    compiled_for = []
+    monkeypatch.setattr(gap, "gap", lambda *_: SimpleNamespace(as_dict=dict, as_text=str))
+    monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, report: compiled_for.append(model))
+    logs.gap([SHIPPED_ROBOT], SHIPPED_ROBOT, tmp_path)
+    assert compiled_for == [tmp_path / "model.toml"]
 
 
 # Each worker imports and compiles the search anew.

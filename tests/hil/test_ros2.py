@@ -155,7 +155,7 @@ def test_it_drives_by_the_poses_of_a_node_that_hears_its_odometry_and_stops_when
     node_file = tmp_path / "node.txt"
     with stack_with_bridge(tmp_path, monkeypatch) as (stack, _), node("echo", node_file) as process:
         stack.operator.wait_until("a pose", lambda status: status["pose_ok"], READY_TIMEOUT_S)
-        status = stack.drive_until("a metre further", lambda _: far(node_file) > 1.0, 30.0)
+        status = stack.drive_until("half a metre further", lambda _: far(node_file) > 0.5, 30.0)
         assert status["pose_ok"]
         assert status["task"]["distance_m"] < 0.2
         process.kill()

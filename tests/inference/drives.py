@@ -18,6 +18,15 @@ from tools.simulated_log import read_back, simulated_log, write_csv
 TRUTH = {"x_icr_m": 0.12, "wheel_radius_m": 0.06, "axial_distance_m": 0.45}
 THETA = np.array([*TRUTH.values()])
 TICKS_PER_REV = 2048
+# Here, as tests of logs that need it have no need of inference, which loads torch.
+ROBOT = f"""
+[robot]
+name = "test"
+wheel_radius_m = 0.055
+axial_distance_m = 0.4
+ticks_per_rev = {TICKS_PER_REV}
+max_wheel_speed_rad_s = 8.0
+"""
 
 
 def robot_config(**prior):

@@ -9,8 +9,8 @@ import pytest
 
 from disco_hw.errors import InputError
 from disco_hw.inference.infer_command import infer_command
-from tests.inference.drives import write_log
-from tests.inference.test_infer_command import ROBOT, finds
+from tests.inference.drives import ROBOT, write_log
+from tests.inference.test_infer_command import finds
 
 
 @pytest.fixture(scope="module")

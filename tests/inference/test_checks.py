@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from disco_hw.effects import Symptom
 from disco_hw.inference.checks import CHECKS, Scores
 from disco_hw.inference.estimates import estimates
 from disco_hw.inference.excitation import excitation
@@ -13,6 +14,11 @@ def scores(hidden=(), drive="rich", seed=5):
     excited_drive = excitation(logged(drive, seed, hidden))
     values = Scores(excited_drive, estimates(excited_drive, noise_of(excited_drive)))(excited_drive.pose)
     return dict(zip((check.name for check in CHECKS), values, strict=True))
+
+
+def test_every_symptom_is_tested_for_and_some_effect_shows_it():
+    assert {check.symptom for check in CHECKS} == set(Symptom)
+    assert all(check.effects for check in CHECKS)
 
 
 def test_nothing_hidden_leaves_no_pattern_and_a_drive_that_cannot_show_one_no_false_alarm():

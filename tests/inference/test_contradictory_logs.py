@@ -11,8 +11,8 @@ from disco_hw.inference import infer as inference
 from disco_hw.inference import infer_command as verb
 from disco_hw.inference.density_network import EmptyRegionError, Region
 from disco_hw.inference.infer import InferOptions
-from tests.inference.drives import logged, robot_config
-from tests.inference.test_infer_command import FEW, ROBOT, finds
+from tests.inference.drives import ROBOT, logged, robot_config
+from tests.inference.test_infer_command import FEW, finds
 from tests.log.contradictory_drives import FAULTS, RADIUS_M, sound, with_wheels
 from tests.tables import thinned
 

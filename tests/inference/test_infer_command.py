@@ -11,6 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from disco_hw.cli import logs
+from disco_hw.config import SHIPPED_ROBOT
+from disco_hw.daemon import run
 from disco_hw.errors import InputError, WorkError
 from disco_hw.inference import infer_command as verb
 from disco_hw.inference.infer import InferOptions
@@ -19,17 +22,7 @@ from disco_hw.inference.simulate import NAMES
 from disco_hw.log.contradictions import Contradiction
 from disco_hw.log.importing import import_log
 from disco_hw.model import Model, load_model
-from tests.inference.drives import TICKS_PER_REV, TRUTH, write_log
-
-ROBOT = f"""
-[robot]
-name = "test"
-wheel_radius_m = 0.055
-axial_distance_m = 0.4
-ticks_per_rev = {TICKS_PER_REV}
-max_wheel_speed_rad_s = 8.0
-"""
-
+from tests.inference.drives import ROBOT, TRUTH, write_log
 
 FEW = InferOptions(simulations=300)
 
@@ -259,3 +252,11 @@ def test_nothing_that_is_read_is_written_over(circle, robot, tmp_path):
 def test_a_file_that_cannot_be_written_is_told_before_the_work(circle, robot):
     with pytest.raises(InputError, match=r"circle\.csv is not a directory; give another path"):
         infer_command([circle], robot, circle / "model.toml", options=FEW, search=finds())
+
+
+def test_a_planner_is_compiled_for_the_model_that_was_written(tmp_path, monkeypatch):
+    compiled_for = []
+    monkeypatch.setattr(verb, "infer_command", lambda *_: SimpleNamespace(as_dict=dict, as_text=str))
+    monkeypatch.setattr(run, "compile_beforehand", lambda robot_file, model, report: compiled_for.append(model))
+    logs.infer([SHIPPED_ROBOT], SHIPPED_ROBOT, tmp_path)
+    assert compiled_for == [tmp_path]

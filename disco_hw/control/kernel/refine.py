@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from disco_hw.jit import block_function, kernel_function, scalar_function
@@ -109,6 +110,21 @@ class Buffers(NamedTuple):
 
 
 @block_function
+def _fill(row: Array, value: float) -> None:
+    """Set all numbers of a row: by a loop, as numba takes a second to compile a kernel's assignments to slices."""
+    for n in range(row.shape[0]):
+        row[n] = value
+
+
+@block_function
+def _copy(source: Array, target: Array) -> None:
+    """Copy rows of commands (N, 2), by a loop as `_fill`."""
+    for n in range(source.shape[0]):
+        for c in range(CHANNELS):
+            target[n, c] = source[n, c]
+
+
+@block_function
 def _begin(states: Array, start: Array, base: Base) -> None:
     """Set row 0 of the states to the start."""
     cos_yaw, sin_yaw = math.cos(start[2]), math.sin(start[2])
@@ -123,7 +139,10 @@ def _roll(
     states: Array, first: int, commands: Array, history: int, time_s: float, drift: Array, lateral: LateralLag,
     remembered: Array | None, base: Base, effects: Coefficients, integration: Integration,
 ) -> None:  # fmt: skip
-    """Fill the rows of `states` behind row `first` from that row."""
+    """Fill the rows of `states` behind row `first` from that row.
+
+    `first` is no literal, for which numba would compile a form of its own.
+    """
     first_input = history - delay_steps(effects)
     for t in range(first, states.shape[0] - 1):
         recent, older = max(t + first_input, 0), max(t + first_input - 1, 0)
@@ -186,8 +205,8 @@ def _cost(problem: Problem, buffers: Buffers, commands: Array) -> float:
     _store_memory(buffers.remembered, problem.means)
     _begin(states, problem.start, base)
     _roll(
-        states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
-        integration,
+        states, np.int64(0), commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered,
+        base, effects, integration,
     )  # fmt: skip
     turned = _last_residual(problem, states)
     cost = turned * turned
@@ -215,8 +234,8 @@ def _linearise(problem: Problem, buffers: Buffers) -> None:
     _store_memory(buffers.remembered, problem.means)
     _begin(states, problem.start, base)
     _roll(
-        states, 0, commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered, base, effects,
-        integration,
+        states, np.int64(0), commands, history, problem.time_s, problem.drift, problem.lateral, buffers.remembered,
+        base, effects, integration,
     )  # fmt: skip
     for t in range(steps):
         residuals[RESIDUALS * t], residuals[RESIDUALS * t + 1] = _residual(problem, states, t)
@@ -322,10 +341,11 @@ def _move_within(problem: Problem, buffers: Buffers) -> None:
     inverse, step_, multipliers = buffers.inverse, buffers.step, buffers.multipliers
     commands, history = buffers.commands, problem.history
     for a in range(size):
-        inverse[a, :] = 0.0
+        _fill(inverse[a], 0.0)
         inverse[a, a] = 1.0
         _solve(buffers.normal, inverse[a])
-    multipliers[:, :] = 0.0
+    for side in range(2):
+        _fill(multipliers[side], 0.0)
     for _ in range(SWEEPS):
         for row in range(2 * size):
             # Rows below `size` bound a command, those above its change.
@@ -375,15 +395,15 @@ def _choose_start(problem: Problem, buffers: Buffers, count: int) -> float:
     """Set the plan to the cheapest of the first `count` starts, brought within the limits; returns its cost."""
     plan, starts = buffers.commands[problem.history :], buffers.starts
     best, least = 0, math.inf
-    buffers.step[:] = 0.0
+    _fill(buffers.step, 0.0)
     for n in range(count):
-        plan[:, :] = starts[n]
+        _copy(starts[n], plan)
         _apply_step(problem, buffers, 0.0)
-        starts[n] = buffers.tried[problem.history :]
+        _copy(buffers.tried[problem.history :], starts[n])
         cost = _cost(problem, buffers, buffers.tried)
         if cost < least:
             best, least = n, cost
-    plan[:, :] = starts[best]
+    _copy(starts[best], plan)
     return least
 
 
@@ -407,7 +427,7 @@ def refine(problem: Problem, buffers: Buffers, count: int, iterations: int) -> f
             tried = _cost(problem, buffers, buffers.tried)
             if tried < cost:
                 cost, improved = tried, True
-                buffers.commands[:, :] = buffers.tried
+                _copy(buffers.tried, buffers.commands)
                 break
             share *= 0.5
         if not improved:

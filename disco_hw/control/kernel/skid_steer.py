@@ -7,9 +7,11 @@ them is costed. What is absent is None, in arguments of their own, as the compil
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
 from disco_hw.control.kernel import (
@@ -57,7 +59,7 @@ from disco_hw.control.kernel.rollout_costs import (
     follow_points,
     look_ups,
 )
-from disco_hw.jit import block_function, cast_like, scalar_function, tune_loops
+from disco_hw.jit import block_function, cast_like, compiled_only, scalar_function, specialise, tune_loops
 from disco_hw.model.added_terms import count_means
 from disco_hw.model.coefficients import (
     Base,
@@ -264,16 +266,28 @@ def _roll(
         end_costs(costs, scaled_at[1], state, SCALED1, task)
 
 
-@scalar_function
-def _bases(base: Base, pair: NDArray[np.int64]) -> tuple[Base, Base]:
-    """Return base coefficients of a pair of points."""
-    return base_point(base, pair[0]), base_point(base, pair[1])
+def _bases(pairs: Pairs, i: int, base: Base) -> BasePair:
+    """Return base coefficients of the pair of points of point i; None without pairs. Compiled code only."""
+    raise compiled_only(pairs)
 
 
-@scalar_function
-def _places(pair: NDArray[np.int64], padded: int, lane: np.uintp) -> CostPlaces:
-    """Return the places at which the costs of a pair of points begin."""
-    return U(pair[0] * padded) + lane, U(pair[1] * padded) + lane
+@specialise(_bases)
+def _bases_of(pairs: types.Type, i: Any, base: Any) -> Callable[..., BasePair]:
+    if isinstance(pairs, types.NoneType):
+        return lambda pairs, i, base: None
+    return lambda pairs, i, base: (base_point(base, pairs[i, 0]), base_point(base, pairs[i, 1]))
+
+
+def _places(pairs: Pairs, i: int, padded: int, lane: np.uintp) -> CostPlaces:
+    """Return the places at which the costs of the pair of point i begin; None without pairs. Compiled code only."""
+    raise compiled_only(pairs)
+
+
+@specialise(_places)
+def _places_of(pairs: types.Type, i: Any, padded: Any, lane: Any) -> Callable[..., CostPlaces]:
+    if isinstance(pairs, types.NoneType):
+        return lambda pairs, i, padded, lane: None
+    return lambda pairs, i, padded, lane: (U(pairs[i, 0] * padded) + lane, U(pairs[i, 1] * padded) + lane)
 
 
 @block_function
@@ -318,19 +332,12 @@ def _roll_points(
                 # Whatever leads equivalent points beside the first point is costed in a rollout of its own.
                 alone = alone and (ahead[i, 0] == -1 or (skip_mean is not None and ahead[i, 0] >= 0))
                 if ahead[i, 0] >= 0:
-                    if scaled is None:
-                        _roll(
-                            costs, at, _places(ahead[i], padded, lane), None, horizon, commands, first_input, wheels,
-                            state, start, means, i, here, skip_mean, _bases(system.base, ahead[i]), None,
-                            acting, integration, task, system.area, straight,
-                        )  # fmt: skip
-                    else:
-                        _roll(
-                            costs, at, _places(ahead[i], padded, lane), _places(scaled[i], padded, lane), horizon,
-                            commands, first_input, wheels, state, start, means, i, here, skip_mean,
-                            _bases(system.base, ahead[i]), _bases(system.base, scaled[i]), acting, integration, task,
-                            system.area, straight,
-                        )  # fmt: skip
+                    # By the types of both, as a branch for `scaled` that is not None would be compiled in vain.
+                    _roll(
+                        costs, at, _places(ahead, i, padded, lane), _places(scaled, i, padded, lane), horizon, commands,
+                        first_input, wheels, state, start, means, i, here, skip_mean, _bases(ahead, i, system.base),
+                        _bases(scaled, i, system.base), acting, integration, task, system.area, straight,
+                    )  # fmt: skip
             if alone:
                 _roll(
                     costs, at, None, None, horizon, commands, first_input, wheels, state, start, means, i, here,

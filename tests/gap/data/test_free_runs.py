@@ -10,7 +10,7 @@ from disco_hw.model import Model
 from disco_hw.model.step import FreeRun
 from tests.gap.synthetic import vector_of
 from tests.tables import thinned
-from tools.compile_kernels import model_with_every_effect
+from tools.every_effect import model_with_every_effect
 
 N = 800
 BASE = (0.06, 0.4, 0.1)

@@ -4,7 +4,7 @@ import tempfile
 
 import pytest
 
-from tests.inference.test_infer_command import ROBOT
+from tests.inference.drives import ROBOT
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -11,7 +11,7 @@ from disco_hw.config import Link
 from disco_hw.errors import InputError, LogError
 from disco_hw.log.importing import import_log
 from disco_hw.log.importing.candump import read_candump
-from tests.inference.test_infer_command import ROBOT as ROBOT_TOML
+from tests.inference.drives import ROBOT as ROBOT_TOML
 from tests.log.importing.test_candump import CONFIG, dumped
 from tests.log.refusals import refused
 

@@ -11,8 +11,7 @@ from disco_hw.log.reader import open_log
 from disco_hw.runtime.replay import replay
 from disco_hw.runtime.robot_setup import setup_of_log
 from disco_hw.viewer.recording import Recording
-from tests.inference.drives import TICKS_PER_REV, write_log
-from tests.inference.test_infer_command import ROBOT
+from tests.inference.drives import ROBOT, TICKS_PER_REV, write_log
 from tests.log.importing.commands import call
 from tests.log.importing.test_candump import dumped
 

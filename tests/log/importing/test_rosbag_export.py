@@ -21,8 +21,7 @@ from disco_hw.log.load import load_drive
 from disco_hw.log.log_command import export_rosbag, write_rosbag
 from disco_hw.log.reader import open_log
 from drivers.types import PoseSample
-from tests.inference.drives import logged, robot_config, write_log
-from tests.inference.test_infer_command import ROBOT
+from tests.inference.drives import ROBOT, logged, robot_config, write_log
 from tests.log.importing.bags import BEGAN_NS
 from tests.log.importing.commands import call
 from tests.runtime.simulated import write_ticks
