@@ -22,7 +22,7 @@ from disco_hw.model.drift import NO_DRIFT, Drift
 Array = NDArray[np.float64]
 # Radians in a turn.
 ROTATION = 2.0 * math.pi
-PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 9, 9, 5
+PLANNER_VERSION, SAME_SINCE_VERSION, DISTURBANCE_UNTIL_VERSION = 10, 10, 5
 """Version of the plans that the default mode makes from the same input; a log names it, and a replay follows it.
 
 1: the sampled plan, as `mode = "sampled"` has it now. 2: the plan is refined beside the line. 3: with other
@@ -33,12 +33,19 @@ to `DISTURBANCE_UNTIL_VERSION`, does nothing. 7: from commands that the model sa
 further ahead where the tracked point lies far behind the centre of rotation. 8: with a guide that ends its turns in
 time and comes back from beyond a corner, and that takes no robot over while it brakes. 9: slower before what the
 wheels' acceleration cannot follow, as a corner, and turned beyond a right angle to the line where the line asks for it.
+10: above 0.9 m/s with longer steps, and refined also while the robot turns before a corner.
 Logs since `SAME_SINCE_VERSION` are replayed alike.
 """
 USUAL_SPEED_M_S, USUAL_STEP_S, USUAL_NOISE = 0.2, 0.1, 0.1 * ROTATION
 # Chosen: longer steps of a slow robot would answer too late to what happens on the way. Refined plans gain by shorter
 # ones: on a circle at 0.1 m/s six robots were 1.7 mm off with steps of 0.1 s, and 5.4 mm with 0.2 s (medians).
 LONGEST_STEP_S, LONGEST_REFINED_STEP_S = 0.25, USUAL_STEP_S
+# Above this speed (m/s) plans have steps of at least so many seconds, and a robot that turns so far (m) before a corner
+# is refined meanwhile. Measured: in shorter steps a plan does not reach the end of a turn that the wheels' acceleration
+# limits. Robots of Husky size at 1.2 and 1.6 m/s, wheels of 5 to 20 rad/s^2, swung to and fro by up to 1.7 m behind
+# corners in 16 of 28 drives with steps of 0.04 s, in 2 with 0.08 s, and in none if they were refined in the turn. In 18
+# others, at 1.0 and 1.4 m/s, they were up to 1.0 m off before, and 0.16 m now.
+FAST_M_S, FAST_STEP_S, FAST_TURN_AHEAD_M = 0.9, 0.08, 0.04
 # Noise of a fast robot grows with this power of its speed: with less it stays beside tight circles, with more it is
 # pulled off them.
 FASTER_NOISE = 0.2
@@ -142,6 +149,7 @@ class DiscoSettings:
     iterations_at_start: optimisation steps for the first plan after a reset.
     refine: whether a Gauss-Newton refinement in the mean of the belief improves the plan beside the task's line
     (refinement.py).
+    turn_ahead_m: so far before a corner a robot that turns to where the line goes on counts as beside its line.
     backwards: whether the robot follows the task's line with its back ahead (backwards.py).
     min_ess: effective sample size below which a step counts as collapsed: it is tried again, and reported.
     retries: further attempts after a step without a valid result; then the plan is dropped and planned anew.
@@ -158,6 +166,7 @@ class DiscoSettings:
     guide_below: float = 0.85
     euler: bool = False
     refine: bool = True
+    turn_ahead_m: float = 0.0
     backwards: bool = False
     iterations_at_start: int = 5
     min_ess: float = 3.0
@@ -208,19 +217,23 @@ class DiscoSettings:
         """Return the settings for a task of this speed (m/s) at `rate_hz` plans a second, with refinement or without.
 
         A slow robot plans over the same way as one at 0.2 m/s, with noise in proportion to its speed; a fast one has
-        shorter steps, but no more than one a plan. With these the mean distance from circles of 0.3 to 3 m stays below
-        2 mm with the true parameters (tests/control/test_no_offset.py).
+        shorter steps, but no more than one a plan, and not below 0.08 s above 0.9 m/s. With these the mean
+        distance from circles of 0.3 to 3 m stays below 2 mm with the true parameters (tests/control/test_no_offset.py).
         """
         slower = USUAL_SPEED_M_S / speed_m_s
         step_s = USUAL_STEP_S * (math.sqrt(slower) if slower < 1.0 else slower)
         step_s = max(min(step_s, LONGEST_STEP_S), 1.0 / rate_hz)
         noise_std = USUAL_NOISE * (slower**-FASTER_NOISE if slower < 1.0 else 1.0 / slower)
         sampler = Sampler(noise_std=noise_std, wide=USUAL_WIDE)
+        is_fast = refine and speed_m_s > FAST_M_S
+        if is_fast:
+            step_s = max(step_s, FAST_STEP_S)
         if refine and step_s > LONGEST_REFINED_STEP_S:
             shorter_s = max(LONGEST_REFINED_STEP_S, 1.0 / rate_hz)
             sampler = replace(sampler, horizon=round(sampler.horizon * step_s / shorter_s))
             step_s = shorter_s
-        return cls(sampler=sampler, step_s=step_s, refine=refine)
+        ahead_m = FAST_TURN_AHEAD_M if is_fast else 0.0
+        return cls(sampler=sampler, step_s=step_s, refine=refine, turn_ahead_m=ahead_m)
 
     @classmethod
     def from_config(cls, control: config.Control, speed_m_s: float, x_icr_m: float) -> DiscoSettings:

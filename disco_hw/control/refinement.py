@@ -68,7 +68,7 @@ class Refinement:
     def __init__(self, limits: CommandLimits, settings: DiscoSettings, history: int) -> None:
         """Refine within the limits, in the steps of `settings`, after `history` commands from before the plan."""
         self._limits, self._step_s, self._history = limits, settings.step_s, history
-        self._backwards = settings.backwards
+        self._backwards, self._turn_ahead_m = settings.backwards, settings.turn_ahead_m
         self._rows = np.arange(min(STEPS, settings.sampler.horizon))
         self._series = integration_series(settings.step_s, wide=True)
         self._reference = np.zeros((self._rows.size, CHANNELS), np.float32)
@@ -159,8 +159,8 @@ class Refinement:
         if hasattr(terms, "line_at"):
             self._call(
                 "timed reference", timed_reference, self._reference, terms, start, self._chassis,
-                self._limits.speed_rad_s, self._limits.acceleration_rad_s2, self._step_s, self._speeds, self._found,
-                self._beyond, BEYOND_X_ICR / BEYOND * x_icr_m,
+                self._limits.speed_rad_s, self._limits.acceleration_rad_s2, self._step_s, self._turn_ahead_m,
+                self._speeds, self._found, self._beyond, BEYOND_X_ICR / BEYOND * x_icr_m,
             )  # fmt: skip
             if carried_m and x_icr_m > SMALLEST_X_ICR_M:
                 last_m = math.dist(*self._reference[-2:].tolist())

@@ -67,3 +67,9 @@ def test_a_robot_is_turned_beyond_a_right_angle_to_the_line_before_a_turn_of_mor
     turn_rad = math.radians(114.0)
     places, _ = drive_round_a_corner((0.061, 0.415, x_icr_m), CommandLimits(8.0, 20.0), 0.5, turn_rad)
     assert off_m(places, turn_rad).max() < 0.015
+
+
+def test_a_robot_that_is_fast_for_its_wheels_comes_to_rest_on_its_line_behind_a_corner():
+    """With a horizon in which it could not end a turn it would swing to and fro by 0.7 m."""
+    places, _ = drive_round_a_corner((0.165, 0.8, 0.1), CommandLimits(12.0, 5.0), 1.6, math.radians(90.0))
+    assert off_m(places, math.radians(90.0)).max() < 0.03

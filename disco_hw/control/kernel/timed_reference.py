@@ -46,21 +46,24 @@ SPEED_COLUMNS = 3
 @kernel_function
 def timed_reference(
     reference: Floats, terms: Terms, start: Floats, chassis: SteeredChassis, largest_rad_s: float,
-    change_rad_s2: float, step_s: float, speeds: Floats, found: Floats, beyond: Floats, beyond_m: float,
+    change_rad_s2: float, step_s: float, turn_ahead_m: float, speeds: Floats, found: Floats, beyond: Floats,
+    beyond_m: float,
 ) -> None:  # fmt: skip
     """Fill `reference` (T, 2) with points (m), relative to the task's origin.
 
     `start` (10,) is the state of `SkidSteer`; `largest_rad_s` and `change_rad_s2` limit the wheels; `speeds`
     (PARTS T, 3) is scratch. Sets `found` (6,): distance to the line (m), cosine of the angle between the robot and the
-    heading in which it would stay on the line, the part of the task's speed that the wheels can do, at most 1, that
-    heading at the end (cosine, sine), and the length of the way from the first point to the last (m).
+    nearer of the headings in which it would stay on the line there and `turn_ahead_m` further, the part of the task's
+    speed that the wheels can do, at most 1, the heading at the end (cosine, sine), and the length of the way from the
+    first point to the last (m).
     And `beyond` (N, 2): that last point, and those behind it along the line, `beyond_m` apart.
     """
     x, y, cos_yaw, sin_yaw = start[START_X], start[START_Y], start[START_COS], start[START_SIN]
     place = place_of(terms, start[START_MEMORY], x, y)
     at_x, at_y, head_x, head_y, _, speed = line_at(terms, place, 0.0)
     found[0] = math.hypot(x - at_x, y - at_y)
-    found[1] = cos_yaw * head_x + sin_yaw * head_y
+    _, _, next_x, next_y, _, _ = line_at(terms, place, turn_ahead_m)
+    found[1] = max(cos_yaw * head_x + sin_yaw * head_y, cos_yaw * next_x + sin_yaw * next_y)
     part_s = step_s / PARTS
     part_m = max(speed * part_s, LEAST_PART_M)
     fastest = USED_SPEED * max(largest_rad_s - chassis.dead_rad_s, 0.0) * chassis.wheel_radius_m
