@@ -73,3 +73,15 @@ def test_a_robot_that_is_fast_for_its_wheels_comes_to_rest_on_its_line_behind_a_
     """With a horizon in which it could not end a turn it would swing to and fro by 0.7 m."""
     places, _ = drive_round_a_corner((0.165, 0.8, 0.1), CommandLimits(12.0, 5.0), 1.6, math.radians(90.0))
     assert off_m(places, math.radians(90.0)).max() < 0.03
+
+
+@pytest.mark.parametrize(("speed_m_s", "is_facing"), [(1.2, True), (0.9, False)])
+def test_a_fast_robot_that_turns_before_a_corner_counts_as_facing_its_line(speed_m_s, is_facing):
+    """Else its plans are not refined in the turn, and it swings to and fro behind the corner."""
+    model = Model(0.165, 0.8, 0.0, belief=replace(SHIPPED.belief, means=np.array([0.0, 0.165, 0.8])))
+    way = LEG_M * np.array([[-1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
+    settings = DiscoSettings.for_speed(speed_m_s, 50.0)
+    planner = Disco(model, PathCost(PathTable(way), speed_m_s), settings, CommandLimits(12.0, 10.0))
+    planner.plan(0, PlannerState(0, -0.02, 0.0, 1.2, 0.0, 0.0))
+    # It faces the line behind the corner by a cosine of 0.93.
+    assert (planner.refinement._found[1] > 0.9) == is_facing
