@@ -42,9 +42,11 @@ PARTS = (
 )
 # These run while the kernels that the others share are being compiled.
 WITHOUT_KERNELS = (
-    *("bridge", "cli", "config", "estimation", "fence", "files", "firmware_protocol", "jit", "processes", "reports"),
-    *("test_architecture.py", "test_docs.py", "test_public.py"),
+    *("bridge", "cli", "config", "daemon", "drivers", "estimation", "fence", "files", "firmware_protocol", "jit"),
+    *("log", "processes", "reports", "viewer", "test_architecture.py", "test_docs.py", "test_public.py"),
 )
+# Files of these folders that need kernels after all.
+WITH_KERNELS = ("daemon/test_warm_up.py", "log/importing/test_candump.py", "viewer/test_replay_state.py")
 
 
 @pytest.hookimpl(trylast=True)
@@ -147,7 +149,10 @@ def is_in_part(path, part):
 
 
 def is_without_kernels(path):
-    return any(path.is_relative_to(TESTS / folder) for folder in WITHOUT_KERNELS)
+    with_kernels, without = (
+        any(path.is_relative_to(TESTS / place) for place in places) for places in (WITH_KERNELS, WITHOUT_KERNELS)
+    )
+    return without and not with_kernels
 
 
 def pytest_ignore_collect(collection_path, config):
