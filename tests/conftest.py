@@ -45,8 +45,11 @@ WITHOUT_KERNELS = (
     *("bridge", "cli", "config", "daemon", "drivers", "estimation", "fence", "files", "firmware_protocol", "jit"),
     *("log", "processes", "reports", "viewer", "test_architecture.py", "test_docs.py", "test_public.py"),
 )
-# Files of these folders that need kernels after all.
-WITH_KERNELS = ("daemon/test_warm_up.py", "log/importing/test_candump.py", "viewer/test_replay_state.py")
+# Files of these folders that need kernels after all, as running each folder with an empty cache of them shows.
+WITH_KERNELS = (
+    *("daemon/test_warm_up.py", "drivers/pose/test_nmea.py", "log/importing/test_candump.py"),
+    *("viewer/test_replay_state.py", "viewer/test_uncertainty.py"),
+)
 
 
 @pytest.hookimpl(trylast=True)
@@ -139,20 +142,22 @@ def pytest_xdist_make_scheduler(config, log):
     return FilesToWorkers(config, log) if config.getvalue("dist") == "loadscope" else None
 
 
+def is_within(path, places):
+    """Whether a path is one of some files and folders of the tests, or in one of them."""
+    return any(path.is_relative_to(TESTS / place) for place in places)
+
+
 def is_in_part(path, part):
     """Whether a file or folder belongs to a part of the tests, or has what does."""
     if not path.is_relative_to(TESTS) or path == TESTS:
         return True
-    within = [at for at, folders in enumerate(PARTS) if any(path.is_relative_to(TESTS / folder) for folder in folders)]
+    within = [at for at, folders in enumerate(PARTS) if is_within(path, folders)]
     has = [at for at, folders in enumerate(PARTS) if any((TESTS / folder).is_relative_to(path) for folder in folders)]
     return part in within if within else part in (*has, len(PARTS))
 
 
 def is_without_kernels(path):
-    with_kernels, without = (
-        any(path.is_relative_to(TESTS / place) for place in places) for places in (WITH_KERNELS, WITHOUT_KERNELS)
-    )
-    return without and not with_kernels
+    return is_within(path, WITHOUT_KERNELS) and not is_within(path, WITH_KERNELS)
 
 
 def pytest_ignore_collect(collection_path, config):

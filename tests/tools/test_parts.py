@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.conftest import PARTS, WITHOUT_KERNELS, KernelsFirst, is_in_part
+from tests.conftest import PARTS, WITH_KERNELS, WITHOUT_KERNELS, KernelsFirst, is_in_part, is_within
 
 TESTS = Path(__file__).parents[1]
 
@@ -31,6 +31,7 @@ def test_every_file_is_read_by_one_worker():
 def test_every_part_names_folders_that_there_are():
     assert all((TESTS / folder).is_dir() for part in PARTS for folder in part)
     assert all((TESTS / one).exists() for one in WITHOUT_KERNELS)
+    assert all((TESTS / one).is_file() and is_within(TESTS / one, WITHOUT_KERNELS) for one in WITH_KERNELS)
 
 
 def test_a_test_that_needs_kernels_waits_until_they_are_compiled(tmp_path, monkeypatch):
@@ -44,8 +45,10 @@ def test_a_test_that_needs_kernels_waits_until_they_are_compiled(tmp_path, monke
     kernels = KernelsFirst(tmp_path / "lock")
     monkeypatch.setattr(fcntl, "flock", waits)
     begin("firmware_protocol/test_codec.py")
-    with pytest.raises(BlockingIOError, match=str(fcntl.LOCK_SH)):
-        begin("control/test_disco.py")
+    begin("daemon/test_check.py")
+    for path in ("control/test_disco.py", "daemon/test_warm_up.py"):
+        with pytest.raises(BlockingIOError, match=str(fcntl.LOCK_SH)):
+            begin(path)
     monkeypatch.undo()
     begin("control/test_disco.py")
     monkeypatch.setattr(fcntl, "flock", waits)
